@@ -12,12 +12,12 @@ use foreframe_data::dataset::import::{DEFAULT_DISK_MIB, ImportConfig, ImportOpti
 use foreframe_data::dataset::{CollectConfig, Dataset, collect, silence_caught_panics};
 use foreframe_core::files::sha256_hex;
 use foreframe_core::frame::codec;
-use foreframe_core::nn::ModelSpec;
+use foreframe_core::registry::Manifest;
 use foreframe::server::protocol::{ClientMessage, Codec};
 use foreframe_core::serving::{SessionSnapshot, SessionState};
 use foreframe_sim::{Scenario, WorldConfig};
 use foreframe_train::training::{self, CHECKPOINT_FILE, CheckpointPosition, TrainConfig, Training};
-use foreframe_core::types::{ModelName, Seed};
+use foreframe_core::types::Seed;
 use libfuzzer_sys::fuzz_target;
 
 #[allow(dead_code)]
@@ -96,21 +96,16 @@ fn images(bytes: &[u8]) {
 }
 
 fn states(bytes: &[u8]) {
-    static SPEC: OnceLock<ModelSpec> = OnceLock::new();
-    let spec = SPEC.get_or_init(|| {
+    static MANIFEST: OnceLock<Manifest> = OnceLock::new();
+    let manifest = MANIFEST.get_or_init(|| {
         let model = concat!(env!("CARGO_MANIFEST_DIR"), "/../models/moving");
-        foreframe_core::registry::load(Path::new(model))
-            .unwrap()
-            .manifest
-            .spec
-            .clone()
+        foreframe_core::registry::manifest::read(Path::new(model)).unwrap()
     });
     let Ok(snapshot) = serde_json::from_slice::<SessionSnapshot>(bytes) else {
         return;
     };
-    let model: ModelName = "moving".parse().unwrap();
-    if let Ok(state) = SessionState::restore(snapshot, &model, spec) {
-        let again = SessionState::restore(state.snapshot(), &model, spec).unwrap();
+    if let Ok(state) = SessionState::restore(snapshot, manifest) {
+        let again = SessionState::restore(state.snapshot(), manifest).unwrap();
         assert!(state.next_seq() == again.next_seq() && state.frame_count() == again.frame_count());
     }
 }

@@ -139,7 +139,7 @@ pub(in crate::server) fn decode(
     }
     let (width, height) = codec::dimensions(&bytes).map_err(refused)?;
     let Some(way) = input.resize else {
-        let checked = check_size(field, model, spec, (width, height));
+        let checked = check_size(field, manifest, (width, height));
         checked.map_err(|error| ImageError::Refused(format!("{error}; set resize to crop, letterbox or stretch")))?;
         return codec::decode(&bytes).map_err(refused);
     };

@@ -1,5 +1,6 @@
 //! Texts of errors for people: an error with its causes in one line, and lists of names.
 
+use std::collections::VecDeque;
 use std::error::Error;
 use std::fmt::{self, Display, Write};
 
@@ -10,13 +11,11 @@ const MAX_SHORTENED_BYTES: usize = 1000;
 #[must_use]
 pub fn with_causes(error: &dyn Error) -> String {
     let mut joined = error.to_string();
-    let mut source = error.source();
-    while let Some(cause) = source {
+    for cause in std::iter::successors(error.source(), |&cause| cause.source()) {
         let text = cause.to_string();
         if !joined.contains(&text) {
             joined = format!("{joined}: {text}");
         }
-        source = cause.source();
     }
     joined
 }
@@ -28,54 +27,35 @@ pub fn without_middle(text: &dyn Display) -> String {
     let mut ends = Ends::default();
     // Nothing but a `Display` that fails gives an error here; what it wrote before is kept.
     let _ = write!(ends, "{text}");
-    ends.joined()
+    let mark = if ends.is_middle_lost { " … " } else { "" };
+    format!("{}{mark}{}", ends.head, String::from_iter(ends.tail))
 }
 
 /// The beginning and the end of what is written into it.
 #[derive(Default)]
 struct Ends {
     head: String,
-    tail: String,
-    is_head_full: bool,
+    tail: VecDeque<char>,
+    tail_bytes: usize,
     is_middle_lost: bool,
-}
-
-impl Ends {
-    /// Bytes of each end.
-    const BYTES: usize = MAX_SHORTENED_BYTES / 2;
-
-    fn joined(mut self) -> String {
-        self.keep_tail();
-        let mark = if self.is_middle_lost { " … " } else { "" };
-        format!("{}{mark}{}", self.head, self.tail)
-    }
-
-    fn keep_tail(&mut self) {
-        let start = self.tail.len().saturating_sub(Self::BYTES);
-        if start > 0 {
-            self.tail.drain(..self.tail.ceil_char_boundary(start));
-            self.is_middle_lost = true;
-        }
-    }
 }
 
 impl Write for Ends {
     fn write_str(&mut self, text: &str) -> fmt::Result {
-        let mut rest = text;
-        if !self.is_head_full {
-            let fitting = text.floor_char_boundary(Self::BYTES - self.head.len());
-            self.head.push_str(&text[..fitting]);
-            rest = &text[fitting..];
-            self.is_head_full = !rest.is_empty();
+        text.chars().try_for_each(|character| self.write_char(character))
+    }
+
+    fn write_char(&mut self, character: char) -> fmt::Result {
+        let length = character.len_utf8();
+        if self.tail.is_empty() && self.head.len() + length <= MAX_SHORTENED_BYTES / 2 {
+            self.head.push(character);
+            return Ok(());
         }
-        let end = rest.ceil_char_boundary(rest.len().saturating_sub(Self::BYTES));
-        if end > 0 {
-            self.tail.clear();
+        self.tail.push_back(character);
+        self.tail_bytes += length;
+        while self.tail_bytes > MAX_SHORTENED_BYTES / 2 {
+            self.tail_bytes -= self.tail.pop_front().map_or(0, char::len_utf8);
             self.is_middle_lost = true;
-        }
-        self.tail.push_str(&rest[end..]);
-        if self.tail.len() > MAX_SHORTENED_BYTES {
-            self.keep_tail();
         }
         Ok(())
     }

@@ -5,12 +5,10 @@ mod positioned;
 
 use std::cmp::Ordering;
 use std::error::Error;
-use std::ffi::OsString;
-use std::fs::File;
-use std::fs::TryLockError;
+use std::fs::{File, TryLockError};
 use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
-use std::time::{Duration, SystemTime};
+use std::time::Duration;
 
 use sha2::{Digest, Sha256};
 
@@ -64,14 +62,10 @@ pub fn try_lock(file: &File) -> Result<(), TryLockError> {
 
 /// The temporary path of a file. It is different in each call, because several writers can write the same file at once.
 pub fn partial_path(path: &Path) -> io::Result<PathBuf> {
-    let name = path.file_name();
-    let mut name = name
-        .ok_or_else(|| io::Error::new(io::ErrorKind::InvalidInput, "the path does not end with a file name"))?
-        .to_owned();
-    name.push(format!(
-        ".{:016x}.{PARTIAL}",
-        getrandom::u64().map_err(io::Error::other)?
-    ));
+    let no_name = || io::Error::new(io::ErrorKind::InvalidInput, "the path does not end with a file name");
+    let mut name = path.file_name().ok_or_else(no_name)?.to_owned();
+    let random = getrandom::u64().map_err(io::Error::other)?;
+    name.push(format!(".{random:016x}.{PARTIAL}"));
     Ok(path.with_file_name(name))
 }
 
@@ -94,22 +88,20 @@ pub fn is_hidden(path: &Path) -> bool {
 
 /// Deletes old partial files below a directory. Files that cannot be deleted are ignored: they do no harm.
 pub fn remove_stale_partials(root: &Path) {
-    let age = |path: &Path| {
-        SystemTime::now()
-            .duration_since(std::fs::metadata(path)?.modified()?)
-            .map_err(io::Error::other)
-    };
-    for path in files_below(root).unwrap_or_default() {
-        if is_partial(&path) && age(&path).is_ok_and(|age| age > STALE_AFTER) {
-            let _ = std::fs::remove_file(path);
-        }
-    }
+    remove_partials_if(root, |path| {
+        let modified = std::fs::metadata(path).and_then(|found| found.modified());
+        modified.is_ok_and(|time| time.elapsed().is_ok_and(|age| age > STALE_AFTER))
+    });
 }
 
 /// Deletes all partial files below a directory that no other process writes to, because this one has locked it.
 pub fn remove_partials(root: &Path) {
+    remove_partials_if(root, |_| true);
+}
+
+fn remove_partials_if(root: &Path, condition: impl Fn(&Path) -> bool) {
     for path in files_below(root).unwrap_or_default() {
-        if is_partial(&path) {
+        if is_partial(&path) && condition(&path) {
             let _ = std::fs::remove_file(path);
         }
     }
@@ -135,16 +127,13 @@ pub fn files_below(root: &Path) -> io::Result<Vec<PathBuf>> {
 /// Deletes a directory. It is renamed first, so its name is free at once. A missing directory is not an error. Also
 /// deletes what earlier, killed deletions left in the same parent directory.
 pub fn remove_dir(dir: &Path) -> io::Result<()> {
-    let mut name = OsString::from(DELETING);
-    name.push(format!("{:016x}", getrandom::u64().map_err(io::Error::other)?));
-    let renamed = dir.with_file_name(name);
+    let random = getrandom::u64().map_err(io::Error::other)?;
+    let renamed = dir.with_file_name(format!("{DELETING}{random:016x}"));
     none_if_missing(std::fs::rename(dir, &renamed))?;
     // Another call can delete the same directory at the same time.
     none_if_missing(std::fs::remove_dir_all(&renamed))?;
-    for left in none_if_missing(std::fs::read_dir(dir.parent().unwrap_or(dir)))?
-        .into_iter()
-        .flatten()
-    {
+    let beside = none_if_missing(std::fs::read_dir(dir.parent().unwrap_or(dir)))?;
+    for left in beside.into_iter().flatten() {
         let left = left?;
         if left.file_name().as_encoded_bytes().starts_with(DELETING.as_bytes()) {
             let _ = std::fs::remove_dir_all(left.path());
@@ -158,17 +147,12 @@ pub fn remove_dir(dir: &Path) -> io::Result<()> {
 pub fn is_transient(error: &(dyn Error + 'static)) -> bool {
     /// Linux's number of an I/O error, which has no `ErrorKind`.
     const EIO: i32 = 5;
-    let mut cause = Some(error);
-    while let Some(error) = cause {
-        if let Some(error) = error.downcast_ref::<io::Error>() {
-            return match error.kind() {
-                io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded | io::ErrorKind::ReadOnlyFilesystem => true,
-                _ => cfg!(unix) && error.raw_os_error() == Some(EIO),
-            };
-        }
-        cause = error.source();
-    }
-    false
+    let mut causes = std::iter::successors(Some(error), |&error| error.source());
+    let error = causes.find_map(|error| error.downcast_ref::<io::Error>());
+    error.is_some_and(|error| match error.kind() {
+        io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded | io::ErrorKind::ReadOnlyFilesystem => true,
+        _ => cfg!(unix) && error.raw_os_error() == Some(EIO),
+    })
 }
 
 /// Turns the error `NotFound` into `None`.
@@ -183,49 +167,33 @@ pub fn none_if_missing<T>(found: io::Result<T>) -> io::Result<Option<T>> {
 /// SHA-256 in lower-case hexadecimal digits.
 #[must_use]
 pub fn sha256_hex(bytes: &[u8]) -> String {
-    hex(&Sha256::digest(bytes))
-}
-
-/// Lower-case hexadecimal digits of the bytes.
-#[must_use]
-pub fn hex(bytes: &[u8]) -> String {
-    ::hex::encode(bytes)
+    format!("{:x}", Sha256::digest(bytes))
 }
 
 /// Compares runs of digits as numbers, so that `2.png` comes before `10.png`.
 pub fn natural_order(a: &str, b: &str) -> Ordering {
-    let (mut left, mut right) = (a, b);
-    loop {
-        let (one, other) = (next_part(&mut left), next_part(&mut right));
-        let order = match (one, other) {
-            ("", "") => return a.cmp(b),
-            (one, other) if is_number(one) && is_number(other) => {
-                let (one, other) = (one.trim_start_matches('0'), other.trim_start_matches('0'));
-                one.len().cmp(&other.len()).then_with(|| one.cmp(other))
-            }
-            (one, other) => one.cmp(other),
-        };
-        if order != Ordering::Equal {
-            return order;
+    natural_parts(a).cmp(natural_parts(b)).then_with(|| a.cmp(b))
+}
+
+/// What orders each run of digits, and each run of other characters: of digits the number of them, after leading zeros. A run
+/// of digits and one of others differ in their first byte, by which any digit gives the same order as 0.
+fn natural_parts(text: &str) -> impl Iterator<Item = (u8, usize, &[u8])> {
+    let runs = text
+        .as_bytes()
+        .chunk_by(|one, next| one.is_ascii_digit() == next.is_ascii_digit());
+    runs.map(|run| {
+        if !run[0].is_ascii_digit() {
+            return (run[0], 0, run);
         }
-    }
-}
-
-fn is_number(part: &str) -> bool {
-    part.starts_with(|c: char| c.is_ascii_digit())
-}
-
-/// Cuts off the first run of digits, or of other characters.
-fn next_part<'a>(text: &mut &'a str) -> &'a str {
-    let starts_with_digit = is_number(text);
-    let end = text.find(|c: char| c.is_ascii_digit() != starts_with_digit);
-    let (part, rest) = text.split_at(end.unwrap_or(text.len()));
-    *text = rest;
-    part
+        let zeros = run.iter().take_while(|&&digit| digit == b'0').count();
+        (b'0', run.len() - zeros, &run[zeros..])
+    })
 }
 
 #[cfg(test)]
 mod tests {
+    use std::time::SystemTime;
+
     use super::*;
 
     #[test]

@@ -1,12 +1,10 @@
 //! A gray camera image with a checked size. [`codec`] reads and writes image files, [`preprocess`] converts frames to and
-//! from the model's value range, [`quality`] compares two images, [`resize`](mod@resize) changes the size, [`warp`] moves pixels,
-//! [`depth`] holds distances in bytes.
+//! from the model's value range, [`quality`] compares two images, [`resize`](mod@resize) changes the size, [`warp`] moves pixels.
 
 use jpeg::JpegDamage;
 
 mod catmull_rom;
 pub mod codec;
-pub mod depth;
 pub mod jpeg;
 pub mod preprocess;
 pub mod quality;
@@ -88,9 +86,7 @@ impl Frame {
     /// A frame of the given size. Errors: `Size` if a side is out of range, `PixelCount` if the number of pixels is not
     /// width × height.
     pub fn new(width: u32, height: u32, pixels: Vec<u8>) -> Result<Self, FrameError> {
-        if !(1..=MAX_SIDE_PX).contains(&width) || !(1..=MAX_SIDE_PX).contains(&height) {
-            return Err(FrameError::Size { width, height });
-        }
+        check_size(width, height)?;
         let expected = width as usize * height as usize;
         if pixels.len() != expected {
             return Err(FrameError::PixelCount {
@@ -131,6 +127,13 @@ impl Frame {
     pub fn pixels_mut(&mut self) -> &mut [u8] {
         &mut self.pixels
     }
+}
+
+/// Errors: `Size` if a side is out of range.
+fn check_size(width: u32, height: u32) -> Result<(), FrameError> {
+    let sides = 1..=MAX_SIDE_PX;
+    let is_in_range = sides.contains(&width) && sides.contains(&height);
+    is_in_range.then_some(()).ok_or(FrameError::Size { width, height })
 }
 
 #[cfg(test)]

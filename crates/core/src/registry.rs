@@ -11,6 +11,8 @@ pub mod manifest;
 
 use std::path::{Path, PathBuf};
 
+use serde_json::{Map, Value};
+
 pub use self::calibration::Calibration;
 pub use self::embedded::{EmbeddedModel, embed};
 pub use self::error::RegistryError;
@@ -24,11 +26,11 @@ use crate::types::ModelName;
 /// Names and directories of the models in a directory, sorted by name. A missing directory contains none; if it is the
 /// default one, the embedded model stands in for it. Errors: `Io` if the directory cannot be listed.
 pub fn list(models_dir: &Path) -> Result<Vec<(ModelName, PathBuf)>, RegistryError> {
-    let named = directories(models_dir)?
-        .into_iter()
-        .filter_map(|path| Some((directory_name(&path).ok()?, path)));
-    let mut models: Vec<_> = named.filter(|(_, path)| path.join(MANIFEST_FILE).is_file()).collect();
-    models.extend(embedded::in_place_of(models_dir));
+    let paths = directories(models_dir)?.into_iter();
+    let mut models: Vec<_> = paths
+        .filter_map(|path| Some((directory_name(&path).ok()?, path)))
+        .chain(embedded::in_place_of(models_dir))
+        .collect();
     models.sort();
     Ok(models)
 }
@@ -36,27 +38,21 @@ pub fn list(models_dir: &Path) -> Result<Vec<(ModelName, PathBuf)>, RegistryErro
 /// The directories that hold a model but have no valid name, sorted, each with its error: [`list`] leaves them out.
 /// Errors: `Io`.
 pub fn misnamed(models_dir: &Path) -> Result<Vec<(PathBuf, RegistryError)>, RegistryError> {
-    let mut paths = directories(models_dir)?;
-    paths.retain(|path| path.join(MANIFEST_FILE).is_file());
-    paths.sort();
     let misnamed = |path: PathBuf| directory_name(&path).err().map(|error| (path, error));
-    Ok(paths.into_iter().filter_map(misnamed).collect())
+    Ok(directories(models_dir)?.into_iter().filter_map(misnamed).collect())
 }
 
-/// Everything in a directory; an absent one holds nothing. Errors: `Io`.
+/// The directories that hold a model, sorted; an absent directory of models holds none. Errors: `Io`.
 fn directories(models_dir: &Path) -> Result<Vec<PathBuf>, RegistryError> {
     if !models_dir.exists() {
         return Ok(Vec::new());
     }
-    let entries = std::fs::read_dir(models_dir).and_then(|entries| {
-        let paths = entries.map(|entry| entry.map(|entry| entry.path()));
-        paths.collect::<Result<Vec<_>, _>>()
-    });
-    entries.map_err(|source| RegistryError::Io {
-        action: "list",
-        path: models_dir.to_owned(),
-        source,
-    })
+    let mut paths: Vec<PathBuf> = std::fs::read_dir(models_dir)
+        .and_then(|entries| entries.map(|entry| Ok(entry?.path())).collect())
+        .map_err(RegistryError::io("list", models_dir))?;
+    paths.retain(|path| path.join(MANIFEST_FILE).is_file());
+    paths.sort();
+    Ok(paths)
 }
 
 /// The name of the model in this directory. Errors: `Name`.
@@ -103,15 +99,7 @@ pub fn directory_of(model: &str) -> Result<Option<PathBuf>, RegistryError> {
 /// Errors: `Weights`, `Manifest`, `Io`.
 pub fn publish(model_dir: &Path, parameters: &Parameters, manifest: &Manifest) -> Result<Manifest, RegistryError> {
     let weights_path = model_dir.join(WEIGHTS_FILE);
-    let failed = |path: &Path| {
-        let path = path.to_owned();
-        move |source| RegistryError::Io {
-            action: "write",
-            path,
-            source,
-        }
-    };
-    std::fs::create_dir_all(model_dir).map_err(failed(model_dir))?;
+    std::fs::create_dir_all(model_dir).map_err(RegistryError::io("write", model_dir))?;
     let weights = loader::serialize_f16(parameters).map_err(|source| RegistryError::Weights {
         path: weights_path.clone(),
         source,
@@ -120,14 +108,14 @@ pub fn publish(model_dir: &Path, parameters: &Parameters, manifest: &Manifest) -
         weights_sha256: sha256_hex(&weights),
         ..manifest.clone()
     };
-    write_atomically(&weights_path, &weights).map_err(failed(&weights_path))?;
+    write_atomically(&weights_path, &weights).map_err(RegistryError::io("write", &weights_path))?;
     write_manifest(model_dir, &manifest)?;
     Ok(manifest)
 }
 
 /// Writes metrics into a model's manifest, for example the results of an evaluation. Other metrics stay; a metric given as
 /// null is removed (JSON merge patch, RFC 7396). Errors: `Manifest`, `Io`.
-pub fn record_metrics(model_dir: &Path, metrics: serde_json::Value) -> Result<(), RegistryError> {
+pub fn record_metrics(model_dir: &Path, metrics: Value) -> Result<(), RegistryError> {
     let mut manifest = manifest::read(model_dir)?;
     merge(&mut manifest.metrics, metrics);
     write_manifest(model_dir, &manifest)
@@ -140,22 +128,23 @@ pub fn record_calibration(model_dir: &Path, calibration: Calibration) -> Result<
     write_manifest(model_dir, &manifest)
 }
 
-fn merge(target: &mut serde_json::Value, patch: serde_json::Value) {
-    let serde_json::Value::Object(patch) = patch else {
+fn merge(target: &mut Value, patch: Value) {
+    let Value::Object(patch) = patch else {
         *target = patch;
         return;
     };
-    if !target.is_object() {
-        *target = serde_json::json!({});
-    }
-    let Some(target) = target.as_object_mut() else { return };
+    let mut merged = match target.take() {
+        Value::Object(object) => object,
+        _ => Map::new(),
+    };
     for (key, value) in patch {
         if value.is_null() {
-            target.remove(&key);
+            merged.remove(&key);
         } else {
-            merge(target.entry(key).or_insert(serde_json::Value::Null), value);
+            merge(merged.entry(key).or_insert(Value::Null), value);
         }
     }
+    *target = Value::Object(merged);
 }
 
 /// Writes the manifest into a model's directory. Errors: `Manifest`, `Io`.
@@ -166,11 +155,7 @@ pub fn write_manifest(model_dir: &Path, manifest: &Manifest) -> Result<(), Regis
         source,
     })?;
     text.push('\n');
-    write_atomically(&path, text.as_bytes()).map_err(|source| RegistryError::Io {
-        action: "write",
-        path,
-        source,
-    })
+    write_atomically(&path, text.as_bytes()).map_err(RegistryError::io("write", &path))
 }
 
 #[cfg(test)]

@@ -155,7 +155,7 @@ impl PredictRequest {
             steps: self.steps,
             frames,
         };
-        Ok((seen, input.into_task(&manifest.name, &manifest.spec)?))
+        Ok((seen, input.into_task(manifest)?))
     }
 }
 

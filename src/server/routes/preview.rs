@@ -56,7 +56,7 @@ async fn make(app: &App, model: Arc<Model>, key: String) -> Result<Bytes, ApiErr
     let simulated = app.render_cache.threads().run(move || simulate(&manifest)).await?;
     let (input, truth) = simulated.map_err(|error| ApiError::Unprocessable(error.to_string()))?;
     let seen = input.frames.clone();
-    let task = input.into_task(&model.manifest.name, &model.manifest.spec)?;
+    let task = input.into_task(&model.manifest)?;
     let mut rollouts = app.predictor().compute(&model, task, None).await?.rollouts;
     let predicted = rollouts.pop().unwrap_or_default().frames;
     let draw = move || picture::png_file(prediction_sheet(&seen, &predicted, &truth));

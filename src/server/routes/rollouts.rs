@@ -187,7 +187,7 @@ impl RolloutRequest {
         let state = predict::last_state(self.state, self.states, frames.len())?;
         let conditioning = conditioning(self.plans, self.steps, state, manifest, config)?;
         let seen = picture::context_for(wanted, &frames);
-        let task = Task::rollout(frames, conditioning, &manifest.name, &manifest.spec)?;
+        let task = Task::rollout(frames, conditioning, manifest)?;
         Ok((seen, task))
     }
 }
@@ -220,7 +220,7 @@ fn conditioning(
         .enumerate()
         .map(|(index, values)| predict::actions(&format!("plans[{index}]"), values))
         .collect::<Result<_, _>>()?;
-    Ok(ConditioningInput::of_plans(plans, state, steps, &manifest.name, spec)?)
+    Ok(ConditioningInput::of_plans(plans, state, steps, manifest)?)
 }
 
 fn answer(

@@ -55,7 +55,7 @@ impl FrameStep {
         Ok(Self {
             seq: message.seq,
             timestamp_us: message.timestamp_us,
-            conditioning: ConditioningInput::new(given, &STEP_FIELDS, &manifest.name, &manifest.spec)?,
+            conditioning: ConditioningInput::new(given, &STEP_FIELDS, manifest)?,
             frame: images::decode("image", message.image, ImageInput { format, resize }, manifest)?,
             format,
             is_overtaken: false,

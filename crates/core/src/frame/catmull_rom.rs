@@ -51,10 +51,7 @@ fn taps(from: usize, to: usize) -> Vec<Taps> {
         let mut weights: Vec<f32> = (first..end)
             .map(|source| kernel((source as f32 - (center - 0.5)) / scale))
             .collect();
-        let mut sum = 0.0;
-        for weight in &weights {
-            sum += weight;
-        }
+        let sum: f32 = weights.iter().sum();
         for weight in &mut weights {
             *weight /= sum;
         }
@@ -82,11 +79,11 @@ pub(super) fn resample(view: GrayView<'_>, width: usize, height: usize) -> Vec<u
             }
         }
         resized.extend(columns.iter().map(|taps| {
-            let mut sum = 0.0f32;
-            for (value, weight) in sums[taps.first..].iter().zip(&taps.weights) {
-                sum += value * weight;
-            }
-            sum.clamp(0.0, 255.0).round() as u8
+            let products = sums[taps.first..]
+                .iter()
+                .zip(&taps.weights)
+                .map(|(sum, weight)| sum * weight);
+            products.sum::<f32>().clamp(0.0, 255.0).round() as u8
         }));
     }
     resized

@@ -4,13 +4,10 @@ use std::io::Cursor;
 
 use image::codecs::gif::{GifEncoder, Repeat};
 use image::{
-    DynamicImage, ExtendedColorType, ImageDecoder as _, ImageEncoder, ImageFormat, ImageReader, Limits, RgbaImage,
+    DynamicImage, ExtendedColorType, GrayImage, ImageDecoder as _, ImageEncoder, ImageFormat, ImageReader, Limits,
 };
 
 use super::{Frame, FrameError, MAX_SIDE_PX, jpeg};
-
-/// Weights of red, green and blue for conversion to gray (ITU-R BT.601), in thousandths.
-const GRAY_FROM_RGB: [u32; 3] = [299, 587, 114];
 
 /// Limit for an image's metadata after decompression, in bytes: colour profiles and similar.
 const MAX_METADATA_BYTES: u64 = 1 << 20;
@@ -29,30 +26,32 @@ pub fn decode(bytes: &[u8]) -> Result<Frame, FrameError> {
         jpeg::check(bytes).map_err(FrameError::Damaged)?;
     }
     let pixel_bytes = u64::from(width) * u64::from(height) * MAX_PIXEL_BYTES;
-    let mut limits = Limits::default();
-    limits.max_image_width = Some(MAX_SIDE_PX);
-    limits.max_image_height = Some(MAX_SIDE_PX);
-    limits.max_alloc = Some(pixel_bytes + MAX_METADATA_BYTES);
-    gray_from_image(&reader(bytes, limits)?.decode().map_err(FrameError::Decode)?)
+    let image = reader(bytes, pixel_bytes + MAX_METADATA_BYTES)?.decode();
+    let pixels = match image.map_err(FrameError::Decode)? {
+        DynamicImage::ImageLuma8(gray) => gray.into_raw(),
+        other => gray_from_rgb(other.into_rgb8().as_raw()),
+    };
+    Frame::new(width, height, pixels)
 }
 
 /// Reads width and height of a PNG or JPEG image without decoding its pixels. Errors: `Decode` if the bytes are not PNG
 /// or JPEG.
 pub fn dimensions(bytes: &[u8]) -> Result<(u32, u32), FrameError> {
-    let mut limits = Limits::default();
-    limits.max_alloc = Some(MAX_METADATA_BYTES);
-    reader(bytes, limits)?.into_dimensions().map_err(FrameError::Decode)
+    let reader = reader(bytes, MAX_METADATA_BYTES)?;
+    reader.into_dimensions().map_err(FrameError::Decode)
 }
 
 /// Whether a PNG or JPEG image has color channels, without decoding its pixels. Errors: `Decode` if the bytes are neither.
 pub fn is_color(bytes: &[u8]) -> Result<bool, FrameError> {
-    let mut limits = Limits::default();
-    limits.max_alloc = Some(MAX_METADATA_BYTES);
-    let decoder = reader(bytes, limits)?.into_decoder().map_err(FrameError::Decode)?;
+    let reader = reader(bytes, MAX_METADATA_BYTES)?;
+    let decoder = reader.into_decoder().map_err(FrameError::Decode)?;
     Ok(decoder.color_type().has_color())
 }
 
-fn reader(bytes: &[u8], limits: Limits) -> Result<ImageReader<Cursor<&[u8]>>, FrameError> {
+/// Reads the image; allocates at most this number of bytes.
+fn reader(bytes: &[u8], max_bytes: u64) -> Result<ImageReader<Cursor<&[u8]>>, FrameError> {
+    let mut limits = Limits::default();
+    limits.max_alloc = Some(max_bytes);
     let mut reader = ImageReader::new(Cursor::new(bytes))
         .with_guessed_format()
         .map_err(|error| FrameError::Decode(error.into()))?;
@@ -63,30 +62,14 @@ fn reader(bytes: &[u8], limits: Limits) -> Result<ImageReader<Cursor<&[u8]>>, Fr
     Ok(reader)
 }
 
-fn gray_from_image(image: &DynamicImage) -> Result<Frame, FrameError> {
-    let (width, height) = (image.width(), image.height());
-    let pixels = match image {
-        DynamicImage::ImageLuma8(gray) => gray.as_raw().clone(),
-        other => gray_from_rgb(other.to_rgb8().as_raw()),
-    };
-    Frame::new(width, height, pixels)
-}
-
 /// Converts interleaved red, green and blue bytes to gray intensities (ITU-R BT.601).
 #[must_use]
 pub fn gray_from_rgb(rgb: &[u8]) -> Vec<u8> {
-    rgb.as_chunks::<3>()
-        .0
-        .iter()
-        .map(|pixel| {
-            let sum: u32 = pixel
-                .iter()
-                .zip(GRAY_FROM_RGB)
-                .map(|(&value, weight)| u32::from(value) * weight)
-                .sum();
-            u8::try_from((sum + 500) / 1000).unwrap_or(u8::MAX)
-        })
-        .collect()
+    let gray = |pixel: &[u8; 3]| {
+        let [red, green, blue] = pixel.map(u32::from);
+        ((299 * red + 587 * green + 114 * blue + 500) / 1000) as u8
+    };
+    rgb.as_chunks().0.iter().map(gray).collect()
 }
 
 /// Encodes the frame as a gray PNG. Errors: `Encode`.
@@ -103,21 +86,13 @@ pub fn encode_gif(frames: &[Frame], delay_ms: u32) -> Result<Vec<u8>, FrameError
     let mut bytes = Vec::new();
     let mut encoder = GifEncoder::new(&mut bytes);
     encoder.set_repeat(Repeat::Infinite).map_err(FrameError::Encode)?;
-    for frame in frames {
-        let rgba = frame
-            .pixels()
-            .iter()
-            .flat_map(|&value| [value, value, value, u8::MAX])
-            .collect();
-        let image = RgbaImage::from_raw(frame.width(), frame.height(), rgba).ok_or(FrameError::Size {
-            width: frame.width(),
-            height: frame.height(),
-        })?;
-        let delay = image::Delay::from_numer_denom_ms(delay_ms, 1);
-        encoder
-            .encode_frame(image::Frame::from_parts(image, 0, 0, delay))
-            .map_err(FrameError::Encode)?;
-    }
+    let delay = image::Delay::from_numer_denom_ms(delay_ms, 1);
+    let images = frames.iter().map(|frame| {
+        let gray = GrayImage::from_raw(frame.width(), frame.height(), frame.pixels().to_vec());
+        let gray = gray.expect("a frame with too few pixels is a bug");
+        image::Frame::from_parts(DynamicImage::ImageLuma8(gray).into_rgba8(), 0, 0, delay)
+    });
+    encoder.encode_frames(images).map_err(FrameError::Encode)?;
     drop(encoder);
     Ok(bytes)
 }

@@ -37,17 +37,12 @@ pub fn ssim(a: &[f32], b: &[f32], width: usize) -> f64 {
 /// NaN for images with a side below 7 px.
 #[must_use]
 pub fn ssim_even(a: &[f32], b: &[f32], width: usize) -> f64 {
-    let window_mean = |p: &[f32], q: Option<&[f32]>| -> Vec<f64> {
-        let values: Vec<f64> = match q {
-            Some(q) => p.iter().zip(q).map(|(p, q)| f64::from(*p) * f64::from(*q)).collect(),
-            None => p.iter().map(|&p| f64::from(p)).collect(),
-        };
-        even_means(&values, width)
-    };
     let count = (EVEN_WINDOW_PX * EVEN_WINDOW_PX) as f64;
     let sample = count / (count - 1.0);
-    let [mean_a, mean_b] = [window_mean(a, None), window_mean(b, None)];
-    let [aa, bb, ab] = [(a, a), (b, b), (a, b)].map(|(p, q)| window_mean(p, Some(q)));
+    let [a, b] = [a, b].map(|image| image.iter().map(|&value| f64::from(value)).collect::<Vec<f64>>());
+    let product = |p: &[f64], q: &[f64]| p.iter().zip(q).map(|(p, q)| p * q).collect::<Vec<f64>>();
+    let [mean_a, mean_b] = [&a, &b].map(|image| even_means(image, width));
+    let [aa, bb, ab] = [(&a, &a), (&b, &b), (&a, &b)].map(|(p, q)| even_means(&product(p, q), width));
     let (c1, c2) = (f64::from(SSIM_C1), f64::from(SSIM_C2));
     let sum: f64 = (0..mean_a.len())
         .map(|at| {

@@ -5,7 +5,7 @@ use std::str::FromStr;
 use serde::{Deserialize, Serialize};
 
 use super::catmull_rom::{GrayView, resample};
-use super::{Frame, FrameError, MAX_SIDE_PX};
+use super::{Frame, FrameError, check_size};
 
 /// How a frame of another shape becomes one of the wanted shape.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize, Serialize)]
@@ -41,13 +41,7 @@ impl FromStr for Resize {
 /// The frame at `width_px`×`height_px`, resized with a Catmull-Rom filter (widened when it makes the frame smaller, so
 /// that details do not alias). A frame of that size comes back unchanged. Errors: `Size` if a side is out of range.
 pub fn resize(frame: &Frame, width_px: u32, height_px: u32, resize: Resize) -> Result<Frame, FrameError> {
-    let sides = 1..=MAX_SIDE_PX;
-    if !sides.contains(&width_px) || !sides.contains(&height_px) {
-        return Err(FrameError::Size {
-            width: width_px,
-            height: height_px,
-        });
-    }
+    check_size(width_px, height_px)?;
     if (frame.width(), frame.height()) == (width_px, height_px) {
         return Ok(frame.clone());
     }
@@ -57,34 +51,32 @@ pub fn resize(frame: &Frame, width_px: u32, height_px: u32, resize: Resize) -> R
         width: frame.width() as usize,
         height: frame.height() as usize,
     };
+    let (width, height) = (width_px as usize, height_px as usize);
     let resized = match resize {
-        Resize::Crop => crop(view, width_px, height_px),
-        Resize::Letterbox => letterbox(view, width_px, height_px),
-        Resize::Stretch => resample(view, width_px as usize, height_px as usize),
+        Resize::Crop => resample(cropped(view, width, height), width, height),
+        Resize::Letterbox => letterbox(view, width, height),
+        Resize::Stretch => resample(view, width, height),
     };
     Frame::new(width_px, height_px, resized)
 }
 
-fn crop(view: GrayView<'_>, width_px: u32, height_px: u32) -> Vec<u8> {
-    let (width, height) = (view.width as u32, view.height as u32);
-    let kept_width = width.min(scaled(height, width_px, height_px));
-    let kept_height = height.min(scaled(width, height_px, width_px));
-    let (left, top) = ((width - kept_width) / 2, (height - kept_height) / 2);
-    let kept = GrayView {
-        pixels: &view.pixels[top as usize * view.stride + left as usize..],
-        stride: view.stride,
-        width: kept_width as usize,
-        height: kept_height as usize,
-    };
-    resample(kept, width_px as usize, height_px as usize)
+/// The largest part of the view, in its middle, of the shape of `width`×`height`.
+fn cropped(view: GrayView<'_>, width: usize, height: usize) -> GrayView<'_> {
+    let kept_width = view.width.min(scaled(view.height, width, height));
+    let kept_height = view.height.min(scaled(view.width, height, width));
+    let (left, top) = ((view.width - kept_width) / 2, (view.height - kept_height) / 2);
+    GrayView {
+        pixels: &view.pixels[top * view.stride + left..],
+        width: kept_width,
+        height: kept_height,
+        ..view
+    }
 }
 
-fn letterbox(view: GrayView<'_>, width_px: u32, height_px: u32) -> Vec<u8> {
-    let (width, height) = (view.width as u32, view.height as u32);
-    let inner_width = width_px.min(scaled(height_px, width, height)) as usize;
-    let inner_height = height_px.min(scaled(width_px, height, width)) as usize;
+fn letterbox(view: GrayView<'_>, width: usize, height: usize) -> Vec<u8> {
+    let inner_width = width.min(scaled(height, view.width, view.height));
+    let inner_height = height.min(scaled(width, view.height, view.width));
     let inner = resample(view, inner_width, inner_height);
-    let (width, height) = (width_px as usize, height_px as usize);
     let (left, top) = ((width - inner_width) / 2, (height - inner_height) / 2);
     let mut whole = vec![0; width * height];
     for (row, pixels) in inner.chunks(inner_width).enumerate() {
@@ -93,8 +85,8 @@ fn letterbox(view: GrayView<'_>, width_px: u32, height_px: u32) -> Vec<u8> {
     whole
 }
 
-/// `length` · `numerator` / `denominator`, rounded, at least 1. Sides are at most [`MAX_SIDE_PX`], so nothing overflows.
-fn scaled(length: u32, numerator: u32, denominator: u32) -> u32 {
+/// `length` · `numerator` / `denominator`, rounded, at least 1. Sides are at most [`super::MAX_SIDE_PX`], so nothing overflows.
+fn scaled(length: usize, numerator: usize, denominator: usize) -> usize {
     ((length * numerator + denominator / 2) / denominator).max(1)
 }
 

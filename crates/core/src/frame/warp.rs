@@ -52,13 +52,12 @@ impl TryFrom<UncheckedCameraModel> for CameraModel {
 impl CameraModel {
     /// A camera of that field of view and tilt, in radians, at an unknown height. Errors: `Camera` if one is out of range.
     pub fn new(horizontal_fov_rad: f32, tilt_down_rad: f32) -> Result<Self, FrameError> {
-        let model = Self {
+        let unchecked = UncheckedCameraModel {
             horizontal_fov_rad,
             tilt_down_rad,
             height_m: None,
         };
-        model.validate()?;
-        Ok(model)
+        unchecked.try_into()
     }
 
     /// Errors: `Camera` if the field of view or the tilt is out of range, `CameraHeight` if the height is.
@@ -112,8 +111,7 @@ pub fn rotation_grid(camera: CameraModel, width: usize, height: usize, yaw_rad: 
 }
 
 /// Which points of a grid lie inside a frame of that size.
-#[must_use]
-pub fn inside(width: usize, height: usize, grid: &[[f32; 2]]) -> Vec<bool> {
+fn inside(width: usize, height: usize, grid: &[[f32; 2]]) -> Vec<bool> {
     let (width, height) = (width as f32, height as f32);
     grid.iter()
         .map(|&[column, row]| (0.0..=width).contains(&column) && (0.0..=height).contains(&row))

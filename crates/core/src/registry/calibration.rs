@@ -53,40 +53,31 @@ impl Calibration {
             }
         }
         let factors = |step: &StepErrors| {
-            let StepErrors {
-                mean_factor,
-                low_factor,
-                high_factor,
-                ..
-            } = *step;
-            step.weights.len() == ERROR_INPUTS && mean_factor > 0.0 && 0.0 <= low_factor && low_factor <= high_factor
+            let is_band = (0.0..=step.high_factor).contains(&step.low_factor);
+            step.weights.len() == ERROR_INPUTS && step.mean_factor > 0.0 && is_band
         };
         let mut ranges = self.actions.iter().chain(&self.states);
-        let checks = [
+        let rules = [
             (
-                "steps",
                 self.steps.iter().all(factors),
-                "each step needs eight weights, a mean_factor above 0, and a low_factor of at most the high_factor",
+                "steps: each step needs eight weights, a mean_factor above 0, and a low_factor of at most the high_factor",
             ),
-            ("novelty.whitening", square, "it must have a row for each statistic"),
+            (square, "novelty.whitening: it must have a row for each statistic"),
             (
-                "novelty",
                 novelty.appearance_scale > 0.0 && novelty.still_scale > 0.0,
-                "appearance_scale and still_scale must be above 0",
+                "novelty: appearance_scale and still_scale must be above 0",
             ),
             (
-                "novelty.quantiles",
                 !novelty.quantiles.is_empty() && novelty.quantiles.is_sorted(),
-                "they must be there, in rising order",
+                "novelty.quantiles: they must be there, in rising order",
             ),
             (
-                "actions and states",
                 ranges.all(|range| range.min <= range.max),
-                "min must be at most max",
+                "actions and states: min must be at most max",
             ),
         ];
-        let failed = checks.iter().find(|(_, holds, _)| !holds);
-        failed.map_or(Ok(()), |(what, _, right)| Err(format!("calibration.{what}: {right}")))
+        let broken = rules.iter().find(|(holds, _)| !holds);
+        broken.map_or(Ok(()), |(_, rule)| Err(format!("calibration.{rule}")))
     }
 }
 
@@ -120,8 +111,9 @@ impl StepErrors {
     /// The error to expect for these inputs. An MSE is at most 1.
     #[must_use]
     pub fn expected(&self, inputs: &[f64; ERROR_INPUTS]) -> ExpectedError {
-        let weighted: f64 = self.weights.iter().zip(inputs).map(|(w, x)| f64::from(*w) * x).sum();
-        let median = (f64::from(self.intercept) + weighted).exp().min(1.0);
+        let median = (f64::from(self.intercept) + weighted_sum(&self.weights, inputs))
+            .exp()
+            .min(1.0);
         let times = |factor: f32| (median * f64::from(factor)).min(1.0) as f32;
         ExpectedError {
             mse: times(self.mean_factor),
@@ -165,23 +157,10 @@ impl NoveltyScale {
     /// Length of the whitened appearance over its scale.
     #[must_use]
     pub fn appearance_distance(&self, context: &ContextStatistics) -> f64 {
-        let centred: Vec<f64> = context
-            .appearance
-            .iter()
-            .zip(&self.mean)
-            .map(|(x, m)| x - f64::from(*m))
-            .collect();
-        let squared: f64 = self
-            .whitening
-            .iter()
-            .map(|row| {
-                row.iter()
-                    .zip(&centred)
-                    .map(|(w, x)| f64::from(*w) * x)
-                    .sum::<f64>()
-                    .powi(2)
-            })
-            .sum();
+        let centred = context.appearance.iter().zip(&self.mean);
+        let centred: Vec<f64> = centred.map(|(x, m)| x - f64::from(*m)).collect();
+        let whitened = self.whitening.iter().map(|row| weighted_sum(row, &centred));
+        let squared: f64 = whitened.map(|value| value.powi(2)).sum();
         squared.sqrt() / f64::from(self.appearance_scale)
     }
 
@@ -198,18 +177,15 @@ impl NoveltyScale {
     pub fn novelty(&self, context: &ContextStatistics) -> f32 {
         let distance = self.distance(context) as f32;
         let above = self.quantiles.partition_point(|&quantile| quantile < distance);
-        let last = self.quantiles.len().saturating_sub(1).max(1);
-        match (
-            above.checked_sub(1).and_then(|below| self.quantiles.get(below)),
-            self.quantiles.get(above),
-        ) {
-            (None, _) => 0.0,
-            (_, None) => 1.0,
-            (Some(low), Some(high)) => {
-                let part = (distance - low) / (high - low).max(f32::MIN_POSITIVE);
-                ((above - 1) as f32 + part.clamp(0.0, 1.0)) / last as f32
-            }
-        }
+        let Some(below) = above.checked_sub(1) else {
+            return 0.0;
+        };
+        let Some(high) = self.quantiles.get(above) else {
+            return 1.0;
+        };
+        let low = self.quantiles[below];
+        let part = (distance - low) / (high - low).max(f32::MIN_POSITIVE);
+        (below as f32 + part.clamp(0.0, 1.0)) / (self.quantiles.len() - 1) as f32
     }
 }
 
@@ -262,12 +238,8 @@ impl RolloutInContext<'_> {
     #[must_use]
     pub fn expected_errors(&self, calibration: &Calibration) -> Vec<ExpectedError> {
         let inputs = self.error_inputs(&calibration.novelty);
-        calibration
-            .steps
-            .iter()
-            .zip(&inputs)
-            .map(|(step, inputs)| step.expected(inputs))
-            .collect()
+        let steps = calibration.steps.iter().zip(&inputs);
+        steps.map(|(step, inputs)| step.expected(inputs)).collect()
     }
 
     /// Root mean square of the scaled actions up to a step; 0 without actions.
@@ -275,11 +247,14 @@ impl RolloutInContext<'_> {
         let scales = &self.spec.actions;
         let taken = (step + 1) * scales.len();
         let scaled = self.actions.iter().zip(scales.iter().cycle()).take(taken);
-        let squares: Vec<f64> = scaled
-            .map(|(value, scale)| f64::from(scale.scaled(*value)).powi(2))
-            .collect();
+        let scaled = scaled.map(|(value, scale)| f64::from(scale.scaled(*value)));
+        let squares: Vec<f64> = scaled.map(|value| value.powi(2)).collect();
         (squares.iter().sum::<f64>() / squares.len().max(1) as f64).sqrt()
     }
+}
+
+fn weighted_sum(weights: &[f32], values: &[f64]) -> f64 {
+    weights.iter().zip(values).map(|(w, x)| f64::from(*w) * x).sum()
 }
 
 /// ln(mean squared difference + [`FLOOR`]).

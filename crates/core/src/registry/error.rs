@@ -1,6 +1,6 @@
 //! Why a model could not be listed, loaded or published.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use super::layout::MANIFEST_FILE;
 use crate::error_kind::{ErrorKind, HasErrorKind};
@@ -83,6 +83,14 @@ pub enum RegistryError {
         /// The reader's error.
         source: crate::nn::TensorError,
     },
+}
+
+impl RegistryError {
+    /// Makes a [`RegistryError::Io`] of a failed `read`, `write` or `list`.
+    pub(super) fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> Self + use<> {
+        let path = path.to_owned();
+        move |source| Self::Io { action, path, source }
+    }
 }
 
 impl HasErrorKind for RegistryError {

@@ -1,7 +1,6 @@
 //! Loads a model from its files. Hash, tensor names and shapes are checked before the model is built. Other programs that
 //! read safetensors can load the same file; `models/README.md` lists the tensors.
 
-use std::borrow::Cow;
 use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
 use std::sync::Arc;
@@ -62,22 +61,22 @@ pub fn load(model_dir: &Path) -> Result<Model, RegistryError> {
     })
 }
 
+/// As [`load`], under another name than the manifest's. Errors: as [`load`].
+pub fn load_as(model_dir: &Path, name: &ModelName) -> Result<Model, RegistryError> {
+    let mut loaded = load(model_dir)?;
+    Arc::make_mut(&mut loaded.manifest).name = name.clone();
+    Ok(loaded)
+}
+
 /// Reads and verifies the weights in a directory. Errors: as [`load`].
 pub fn load_weights(model_dir: &Path) -> Result<StoredWeights, RegistryError> {
     let manifest = manifest::read(model_dir)?;
-    let checked = manifest.spec.validate().map_err(|error| error.to_string());
-    let calibrated = |()| (manifest.calibration.iter()).try_for_each(|calibration| calibration.check(&manifest.spec));
-    checked
-        .and_then(calibrated)
-        .map_err(|reason| RegistryError::ManifestValue {
-            path: model_dir.join(MANIFEST_FILE),
-            reason,
-        })?;
+    check_values(&manifest).map_err(|reason| RegistryError::ManifestValue {
+        path: model_dir.join(MANIFEST_FILE),
+        reason,
+    })?;
     let path = model_dir.join(WEIGHTS_FILE);
-    let bytes = match embedded::weights(model_dir) {
-        Some(bytes) => Cow::Borrowed(bytes),
-        None => Cow::Owned(read_weights(&path)?),
-    };
+    let bytes = embedded::read_weights(model_dir, MAX_WEIGHTS_BYTES)?;
     let found = sha256_hex(&bytes);
     if found != manifest.weights_sha256 {
         return Err(RegistryError::Hash {
@@ -96,33 +95,13 @@ pub fn load_weights(model_dir: &Path) -> Result<StoredWeights, RegistryError> {
     Ok(StoredWeights { manifest, parameters })
 }
 
-/// The bytes of a weights file. Errors: `Io`, also if it is too large.
-fn read_weights(path: &Path) -> Result<Vec<u8>, RegistryError> {
-    let read_failed = |source| RegistryError::Io {
-        action: "read",
-        path: path.to_owned(),
-        source,
-    };
-    let size = std::fs::metadata(path).map_err(read_failed)?.len();
-    if size > MAX_WEIGHTS_BYTES {
-        return Err(read_failed(std::io::Error::other(format!(
-            "the file has {size} bytes; at most {MAX_WEIGHTS_BYTES} are allowed"
-        ))));
+/// Errors: which value of the manifest is out of range, and what it must be.
+fn check_values(manifest: &Manifest) -> Result<(), String> {
+    manifest.spec.validate().map_err(|error| error.to_string())?;
+    match &manifest.calibration {
+        Some(calibration) => calibration.check(&manifest.spec),
+        None => Ok(()),
     }
-    std::fs::read(path).map_err(read_failed)
-}
-
-/// As [`load`], under another name than the manifest's. Errors: as [`load`].
-pub fn load_as(model_dir: &Path, name: &ModelName) -> Result<Model, RegistryError> {
-    let loaded = load(model_dir)?;
-    let manifest = Manifest {
-        name: name.clone(),
-        ..(*loaded.manifest).clone()
-    };
-    Ok(Model {
-        manifest: Arc::new(manifest),
-        network: loaded.network,
-    })
 }
 
 /// The parameters as the bytes of a safetensors file, in half precision, sorted by name.

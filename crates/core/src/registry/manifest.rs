@@ -94,26 +94,9 @@ pub fn set_git_commit(commit: &'static str) {
 
 /// Reads the manifest in a model's directory. Errors: `Io`, `Manifest`.
 pub fn read(model_dir: &Path) -> Result<Manifest, RegistryError> {
-    let path = model_dir.join(MANIFEST_FILE);
-    if let Some(text) = embedded::manifest(model_dir) {
-        return serde_json::from_slice(text).map_err(|source| RegistryError::Manifest { path, source });
-    }
-    let failed = |source| RegistryError::Io {
-        action: "read",
-        path: path.clone(),
+    let text = embedded::read_manifest(model_dir, MAX_MANIFEST_BYTES)?;
+    serde_json::from_slice(&text).map_err(|source| RegistryError::Manifest {
+        path: model_dir.join(MANIFEST_FILE),
         source,
-    };
-    let size = std::fs::metadata(&path).map_err(failed)?.len();
-    if size > MAX_MANIFEST_BYTES {
-        let source = std::io::Error::other(format!(
-            "the file has {size} bytes; at most {MAX_MANIFEST_BYTES} are allowed"
-        ));
-        return Err(RegistryError::Io {
-            action: "read",
-            path,
-            source,
-        });
-    }
-    let text = std::fs::read(&path).map_err(failed)?;
-    serde_json::from_slice(&text).map_err(|source| RegistryError::Manifest { path, source })
+    })
 }

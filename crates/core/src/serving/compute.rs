@@ -9,9 +9,9 @@ use super::conditioning::ConditioningInput;
 use super::error::ServingError;
 use super::prediction::{Prediction, Rollout, Timing};
 use super::task::{Features, Task};
-use crate::frame::Frame;
+use crate::frame::{Frame, FrameError};
 use crate::nn::tensors::with_values;
-use crate::nn::{ConditioningTensors, ModelSpec};
+use crate::nn::{ConditioningTensors, ModelSpec, NnError};
 use crate::registry::Model;
 use crate::registry::calibration::{ContextStatistics, RolloutInContext};
 use crate::types::{Action, RobotState};
@@ -20,108 +20,76 @@ use crate::types::{Action, RobotState};
 const DECODED_FRAMES: usize = 1024;
 
 /// Computes the tasks as one batch, without warnings and timing: one matrix product encodes all new frames, and one predicts all rollouts.
-/// Errors: `Model` if a task does not fit the model, `Tensor`, `Frame`.
+/// Errors: `Model` if a task does not fit the model, `Frame`.
 pub(super) fn run(loaded: &Model, tasks: &[&Task]) -> Result<Vec<Prediction>, ServingError> {
+    compute(loaded, tasks).map_err(|failure| {
+        let model = loaded.manifest.name.clone();
+        match failure {
+            Failure::Network(source) => ServingError::Model {
+                model,
+                source: Arc::new(source),
+            },
+            Failure::Image(source) => ServingError::Frame { model, source },
+        }
+    })
+}
+
+/// Why a model's computation failed.
+enum Failure {
+    Network(NnError),
+    Image(FrameError),
+}
+
+impl<E: Into<NnError>> From<E> for Failure {
+    fn from(error: E) -> Self {
+        Self::Network(error.into())
+    }
+}
+
+/// The index of a window and a conditioning input: what a rollout is predicted from.
+type RolloutRow<'a> = (u32, &'a ConditioningInput);
+
+fn compute(loaded: &Model, tasks: &[&Task]) -> Result<Vec<Prediction>, Failure> {
     let mut encoded = encode(loaded, tasks)?.into_iter();
-    let mut predictions: Vec<Prediction> = tasks
-        .iter()
-        .map(|task| Prediction {
+    let (mut predictions, mut windows, mut rows) = (Vec::new(), Vec::new(), Vec::<RolloutRow>::new());
+    for task in tasks {
+        let features: Vec<Features> = encoded.by_ref().take(task.frames.len()).collect();
+        if !task.conditioning_inputs.is_empty() {
+            let window = windows.len() as u32;
+            rows.extend(task.conditioning_inputs.iter().map(|input| (window, input)));
+            windows.push(task.past_features.iter().chain(&features).cloned().collect());
+        }
+        predictions.push(Prediction {
             manifest: Arc::clone(&loaded.manifest),
-            features: encoded.by_ref().take(task.frames.len()).collect(),
-            rollouts: Vec::with_capacity(task.conditioning_inputs.len()),
+            features,
+            rollouts: Vec::new(),
             warnings: Vec::new(),
             timing: Timing::default(),
-        })
-        .collect();
-    let (mut windows, mut window_of) = (Vec::new(), Vec::new());
-    for (task, prediction) in tasks
-        .iter()
-        .zip(&predictions)
-        .filter(|(task, _)| !task.conditioning_inputs.is_empty())
-    {
-        window_of.extend(vec![windows.len() as u32; task.conditioning_inputs.len()]);
-        windows.push(task.past_features.iter().chain(&prediction.features));
+        });
     }
-    let conditioning_inputs: Vec<&ConditioningInput> =
-        tasks.iter().flat_map(|task| &task.conditioning_inputs).collect();
-    if conditioning_inputs.is_empty() {
+    if rows.is_empty() {
         return Ok(predictions);
     }
-    let values = windows
-        .into_iter()
-        .flatten()
-        .map(AsRef::as_ref)
-        .collect::<Vec<&[f32]>>()
-        .concat();
-    let mut rollouts = predict_windows(loaded, values, &window_of, &conditioning_inputs)?.into_iter();
+    let mut rollouts = Windows::new(loaded, &windows)?.predict(&rows)?.into_iter();
     for (task, prediction) in tasks.iter().zip(&mut predictions) {
-        prediction
-            .rollouts
-            .extend(rollouts.by_ref().take(task.conditioning_inputs.len()));
+        prediction.rollouts = rollouts.by_ref().take(task.conditioning_inputs.len()).collect();
     }
     Ok(predictions)
 }
 
 /// The features of all the tasks' frames, in order.
-fn encode(loaded: &Model, tasks: &[&Task]) -> Result<Vec<Features>, ServingError> {
+fn encode(loaded: &Model, tasks: &[&Task]) -> Result<Vec<Features>, Failure> {
     let spec = loaded.spec();
-    let frames: Vec<&Frame> = tasks.iter().flat_map(|task| &task.frames).collect();
-    if frames.is_empty() {
+    let frames = tasks.iter().flat_map(|task| &task.frames);
+    let values: Vec<Vec<f32>> = frames.map(|frame| spec.preprocess.forward(frame)).collect();
+    if values.is_empty() {
         return Ok(Vec::new());
     }
-    let values: Vec<Vec<f32>> = frames.iter().map(|frame| spec.preprocess.forward(frame)).collect();
-    let features = Tensor::from_vec(values.concat(), (frames.len(), spec.pixels()), &Device::Cpu)
-        .map_err(tensor_error)
-        .and_then(|frames| {
-            loaded
-                .network
-                .encode_frames(&frames)
-                .map_err(|source| model_error(loaded, source))
-        })?;
-    with_values(&features, |values| {
+    let frames = Tensor::from_vec(values.concat(), (values.len(), spec.pixels()), &Device::Cpu)?;
+    let features = loaded.network.encode_frames(&frames)?;
+    Ok(with_values(&features, |values| {
         values.chunks_exact(spec.code_len()).map(Features::from).collect()
-    })
-    .map_err(tensor_error)
-}
-
-/// The rollout of each conditioning input. `values` holds the features of all windows, one after the other; `window_of` is the
-/// index of the window of each conditioning input. Rollouts of the same number of steps are computed together.
-fn predict_windows(
-    loaded: &Model,
-    values: Vec<f32>,
-    window_of: &[u32],
-    conditioning_inputs: &[&ConditioningInput],
-) -> Result<Vec<Rollout>, ServingError> {
-    let spec = loaded.spec();
-    let contexts = match &loaded.manifest.calibration {
-        Some(_) => ContextStatistics::of_codes(&loaded.network, &values, spec.context)
-            .map_err(|source| model_error(loaded, source))?,
-        None => Vec::new(),
-    };
-    let shape = (
-        values.len() / (spec.context * spec.code_len()),
-        spec.context,
-        spec.code_len(),
-    );
-    let windows = Windows {
-        loaded,
-        contexts,
-        features: Tensor::from_vec(values, shape, &Device::Cpu).map_err(tensor_error)?,
-    };
-    let mut rollouts = vec![Rollout::default(); conditioning_inputs.len()];
-    let steps: BTreeSet<usize> = conditioning_inputs.iter().map(|input| input.steps(spec)).collect();
-    for steps in steps {
-        let same = |place: &usize| conditioning_inputs[*place].steps(spec) == steps;
-        let places: Vec<usize> = (0..conditioning_inputs.len()).filter(same).collect();
-        let rows: Vec<(u32, &ConditioningInput)> = places
-            .iter()
-            .map(|&place| (window_of[place], conditioning_inputs[place]))
-            .collect();
-        for (place, rollout) in places.into_iter().zip(windows.rollouts(&rows, steps)?) {
-            rollouts[place] = rollout;
-        }
-    }
-    Ok(rollouts)
+    })?)
 }
 
 /// The contexts of a batch.
@@ -133,44 +101,70 @@ struct Windows<'a> {
     features: Tensor,
 }
 
-impl Windows<'_> {
-    /// Rollouts of `steps` frames. A row is the index of a window and a conditioning input.
-    fn rollouts(&self, rows: &[(u32, &ConditioningInput)], steps: usize) -> Result<Vec<Rollout>, ServingError> {
-        let (loaded, spec) = (self.loaded, self.loaded.spec());
+impl<'a> Windows<'a> {
+    /// From the features of each window's frames.
+    fn new(loaded: &'a Model, windows: &[Vec<Features>]) -> Result<Self, Failure> {
+        let spec = loaded.spec();
+        let values = windows
+            .iter()
+            .flatten()
+            .map(AsRef::as_ref)
+            .collect::<Vec<&[f32]>>()
+            .concat();
+        let contexts = match &loaded.manifest.calibration {
+            Some(_) => ContextStatistics::of_codes(&loaded.network, &values, spec.context)?,
+            None => Vec::new(),
+        };
+        let frames = values.len() / spec.code_len();
+        let shape = (frames / spec.context, spec.context, spec.code_len());
+        Ok(Self {
+            loaded,
+            contexts,
+            features: Tensor::from_vec(values, shape, &Device::Cpu)?,
+        })
+    }
+
+    /// The rollout of each row. Rollouts of the same number of steps are computed together.
+    fn predict(&self, rows: &[RolloutRow<'_>]) -> Result<Vec<Rollout>, Failure> {
+        let spec = self.loaded.spec();
+        let mut rollouts = vec![Rollout::default(); rows.len()];
+        let steps: BTreeSet<usize> = rows.iter().map(|(_, input)| input.steps(spec)).collect();
+        for steps in steps {
+            let same = rows.iter().copied().enumerate();
+            let same = same.filter(|(_, (_, input))| input.steps(spec) == steps);
+            let (places, rows): (Vec<usize>, Vec<RolloutRow<'_>>) = same.unzip();
+            for (place, rollout) in places.into_iter().zip(self.rollouts(&rows, steps)?) {
+                rollouts[place] = rollout;
+            }
+        }
+        Ok(rollouts)
+    }
+
+    /// Rollouts of `steps` frames.
+    fn rollouts(&self, rows: &[RolloutRow<'_>], steps: usize) -> Result<Vec<Rollout>, Failure> {
+        let spec = self.loaded.spec();
         let (window_of, inputs): (Vec<u32>, Vec<&ConditioningInput>) = rows.iter().copied().unzip();
-        let codes = loaded
-            .network
-            .predict_steps(&self.features, &window_of, &condition(spec, &inputs, steps)?, steps)
-            .and_then(|predicted| Ok(predicted.flatten(0, 1)?))
-            .map_err(|source| model_error(loaded, source))?;
-        let mut frames = decode(loaded, &codes, rows.len() * steps)?.into_iter();
-        let frames = rows.iter().map(|_| frames.by_ref().take(steps).collect());
-        let frames: Vec<Vec<Frame>> = frames.collect();
-        with_values(&self.features, |seen| {
+        let conditioning = condition(spec, &inputs, steps)?;
+        let network = &self.loaded.network;
+        let codes = network.predict_steps(&self.features, &window_of, &conditioning, steps)?;
+        let codes = codes.flatten(0, 1)?;
+        let mut frames = decode(self.loaded, &codes, rows.len() * steps)?.into_iter();
+        Ok(with_values(&self.features, |seen| {
             with_values(&codes, |codes| {
                 let codes = codes.chunks_exact(steps * spec.code_len());
-                let rollouts = rows.iter().zip(codes).zip(frames);
+                let rollouts = rows.iter().zip(codes);
                 rollouts
-                    .map(|((row, codes), frames)| self.rollout(*row, seen, codes, frames))
+                    .map(|(row, codes)| self.rollout(*row, seen, codes, frames.by_ref().take(steps).collect()))
                     .collect()
             })
-        })
-        .and_then(|rollouts| rollouts)
-        .map_err(tensor_error)
+        })??)
     }
 
     /// A rollout with its expected errors and its novelty. `seen`: the features of all windows.
-    fn rollout(
-        &self,
-        (window, input): (u32, &ConditioningInput),
-        seen: &[f32],
-        codes: &[f32],
-        frames: Vec<Frame>,
-    ) -> Rollout {
+    fn rollout(&self, (window, input): RolloutRow<'_>, seen: &[f32], codes: &[f32], frames: Vec<Frame>) -> Rollout {
         let spec = self.loaded.spec();
-        let (Some(calibration), Some(context)) =
-            (&self.loaded.manifest.calibration, self.contexts.get(window as usize))
-        else {
+        let (calibration, context) = (&self.loaded.manifest.calibration, self.contexts.get(window as usize));
+        let (Some(calibration), Some(context)) = (calibration, context) else {
             return Rollout {
                 frames,
                 ..Rollout::default()
@@ -198,73 +192,40 @@ impl Windows<'_> {
 }
 
 /// The frames of `total` predicted codes.
-fn decode(loaded: &Model, codes: &Tensor, total: usize) -> Result<Vec<Frame>, ServingError> {
+fn decode(loaded: &Model, codes: &Tensor, total: usize) -> Result<Vec<Frame>, Failure> {
+    let spec = loaded.spec();
+    let (width, height) = (spec.frame_width_px, spec.frame_height_px);
     let mut frames = Vec::with_capacity(total);
     for first in (0..total).step_by(DECODED_FRAMES) {
-        let part = codes
-            .narrow(0, first, DECODED_FRAMES.min(total - first))
-            .map_err(tensor_error)?;
-        let pixels = loaded
-            .network
-            .decode_frames(&part)
-            .map_err(|source| model_error(loaded, source))?;
-        frames.extend(with_values(&pixels, |values| images(loaded, values)).map_err(tensor_error)??);
+        let part = codes.narrow(0, first, DECODED_FRAMES.min(total - first))?;
+        let decoded = loaded.network.decode_frames(&part)?;
+        with_values(&decoded, |values| {
+            for pixels in values.chunks_exact(spec.pixels()) {
+                frames.push(spec.preprocess.frame_from(pixels, width, height)?);
+            }
+            Ok(())
+        })?
+        .map_err(Failure::Image)?;
     }
     Ok(frames)
 }
 
-fn images(loaded: &Model, values: &[f32]) -> Result<Vec<Frame>, ServingError> {
-    let spec = loaded.spec();
-    let frame = |pixels| {
-        spec.preprocess
-            .frame_from(pixels, spec.frame_width_px, spec.frame_height_px)
-    };
-    let frames = values.chunks_exact(spec.pixels()).map(frame);
-    frames.collect::<Result<_, _>>().map_err(|source| ServingError::Frame {
-        model: loaded.manifest.name.clone(),
-        source,
-    })
-}
-
 /// Actions `[N, steps, A]` and states `[N, S]` in physical units, if the model takes them.
-fn condition(
-    spec: &ModelSpec,
-    conditioning_inputs: &[&ConditioningInput],
-    steps: usize,
-) -> Result<ConditioningTensors, ServingError> {
-    let actions = conditioning_inputs
+fn condition(spec: &ModelSpec, inputs: &[&ConditioningInput], steps: usize) -> Result<ConditioningTensors, Failure> {
+    let actions = inputs
         .iter()
-        .flat_map(|conditioning| &conditioning.actions)
+        .flat_map(|input| &input.actions)
         .flat_map(Action::as_slice);
-    let states = conditioning_inputs
+    let states = inputs
         .iter()
-        .flat_map(|conditioning| &conditioning.state)
+        .flat_map(|input| &input.state)
         .flat_map(RobotState::as_slice);
     let tensor = |values: Vec<f32>, shape: &[usize]| {
         let given = !values.is_empty();
-        given
-            .then(|| Tensor::from_vec(values, shape, &Device::Cpu).map_err(tensor_error))
-            .transpose()
+        given.then(|| Tensor::from_vec(values, shape, &Device::Cpu)).transpose()
     };
     Ok(ConditioningTensors {
-        actions: tensor(
-            actions.copied().collect(),
-            &[conditioning_inputs.len(), steps, spec.actions.len()],
-        )?,
-        state: tensor(
-            states.copied().collect(),
-            &[conditioning_inputs.len(), spec.states.len()],
-        )?,
+        actions: tensor(actions.copied().collect(), &[inputs.len(), steps, spec.actions.len()])?,
+        state: tensor(states.copied().collect(), &[inputs.len(), spec.states.len()])?,
     })
-}
-
-fn model_error(loaded: &Model, source: crate::nn::NnError) -> ServingError {
-    ServingError::Model {
-        model: loaded.manifest.name.clone(),
-        source: Arc::new(source),
-    }
-}
-
-fn tensor_error(source: candle_core::Error) -> ServingError {
-    ServingError::Tensor(Arc::new(source.into()))
 }

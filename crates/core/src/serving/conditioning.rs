@@ -1,8 +1,10 @@
 //! The state and the actions under which frames are predicted, and the check that they fit a model.
 
 use super::error::InputError;
+use crate::error_text::comma_separated;
 use crate::nn::spec::MAX_STEPS;
 use crate::nn::{ChannelScale, Conditioning, ModelSpec};
+use crate::registry::Manifest;
 use crate::types::{Action, ModelName, RobotState};
 
 /// The state at the last frame and the action for each predicted frame, as far as the model takes them. Checked.
@@ -49,12 +51,8 @@ pub const STEP_FIELDS: FieldNames = FieldNames {
 
 impl ConditioningInput {
     /// Checks the input and keeps what the model takes. Errors name the field, its value and the expected value.
-    pub fn new(
-        raw: RawConditioning<'_>,
-        fields: &FieldNames,
-        model: &ModelName,
-        spec: &ModelSpec,
-    ) -> Result<Self, InputError> {
+    pub fn new(raw: RawConditioning<'_>, fields: &FieldNames, manifest: &Manifest) -> Result<Self, InputError> {
+        let (model, spec) = (&manifest.name, &manifest.spec);
         let steps = raw.steps.unwrap_or(spec.horizon);
         if !(1..=MAX_STEPS).contains(&steps) {
             return Err(InputError::Steps { found: steps });
@@ -71,7 +69,7 @@ impl ConditioningInput {
         let actions = match (raw.plan, raw.past.last()) {
             _ if spec.action_inputs().is_none() => Vec::new(),
             (Some(actions), _) => {
-                check_actions(fields.plan, model, steps, spec, actions)?;
+                check_actions(fields.plan, manifest, steps, actions)?;
                 actions.to_vec()
             }
             (None, Some(held)) => vec![held.clone(); steps],
@@ -79,13 +77,13 @@ impl ConditioningInput {
                 return Err(InputError::Missing {
                     field: fields.missing,
                     model: model.clone(),
-                    channels: channels_of(&spec.actions).join(", "),
+                    channels: comma_separated(&spec.actions),
                 });
             }
         };
         Ok(Self {
             actions,
-            state: check_state(model, spec, raw.state.cloned())?,
+            state: check_state(manifest, raw.state.cloned())?,
             steps: raw.steps,
         })
     }
@@ -96,21 +94,16 @@ impl ConditioningInput {
         plans: Vec<Vec<Action>>,
         state: Option<RobotState>,
         steps: Option<usize>,
-        model: &ModelName,
-        spec: &ModelSpec,
+        manifest: &Manifest,
     ) -> Result<Vec<Self>, InputError> {
-        if spec.action_inputs().is_none() {
-            return Err(InputError::Unconditioned { model: model.clone() });
+        if manifest.spec.action_inputs().is_none() {
+            let model = manifest.name.clone();
+            return Err(InputError::Unconditioned { model });
         }
-        let state = check_state(model, spec, state)?;
+        let state = check_state(manifest, state)?;
+        let expected = steps.unwrap_or(manifest.spec.horizon);
         let conditioning = |(index, actions): (usize, Vec<Action>)| {
-            check_actions(
-                &format!("plans[{index}]"),
-                model,
-                steps.unwrap_or(spec.horizon),
-                spec,
-                &actions,
-            )?;
+            check_actions(&format!("plans[{index}]"), manifest, expected, &actions)?;
             let state = state.clone();
             Ok(Self { actions, state, steps })
         };
@@ -124,33 +117,25 @@ impl ConditioningInput {
 }
 
 /// Checks that there are as many actions as steps and that each action has all channels.
-fn check_actions(
-    field: &str,
-    model: &ModelName,
-    steps: usize,
-    spec: &ModelSpec,
-    actions: &[Action],
-) -> Result<(), InputError> {
+fn check_actions(field: &str, manifest: &Manifest, steps: usize, actions: &[Action]) -> Result<(), InputError> {
     if actions.len() != steps {
         return Err(InputError::PlanLength {
             field: field.to_owned(),
-            model: model.clone(),
+            model: manifest.name.clone(),
             found: actions.len(),
             expected: steps,
         });
     }
     for (index, action) in actions.iter().enumerate() {
-        check_length(|| format!("{field}[{index}]"), model, action.as_slice(), &spec.actions)?;
+        let field = || format!("{field}[{index}]");
+        check_length(field, &manifest.name, action.as_slice(), &manifest.spec.actions)?;
     }
     Ok(())
 }
 
 /// Checks the state; `None` if the model takes none.
-fn check_state(
-    model: &ModelName,
-    spec: &ModelSpec,
-    state: Option<RobotState>,
-) -> Result<Option<RobotState>, InputError> {
+fn check_state(manifest: &Manifest, state: Option<RobotState>) -> Result<Option<RobotState>, InputError> {
+    let (model, spec) = (&manifest.name, &manifest.spec);
     if spec.state_inputs().is_none() {
         return Ok(None);
     }
@@ -158,7 +143,7 @@ fn check_state(
         return Err(InputError::Missing {
             field: "state",
             model: model.clone(),
-            channels: channels_of(&spec.states).join(", "),
+            channels: comma_separated(&spec.states),
         });
     };
     check_length(|| "state".to_owned(), model, state.as_slice(), &spec.states)?;
@@ -179,13 +164,6 @@ fn check_length(
         model: model.clone(),
         found: values.len(),
         expected: scales.len(),
-        channels: channels_of(scales).join(", "),
+        channels: comma_separated(scales),
     })
-}
-
-fn channels_of(scales: &[ChannelScale]) -> Vec<String> {
-    scales
-        .iter()
-        .map(|scale| format!("{} {}", scale.name, scale.unit).trim_end().to_owned())
-        .collect()
 }

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use crate::error_kind::{ErrorKind, HasErrorKind};
 use crate::error_text::comma_separated;
 use crate::frame::FrameError;
-use crate::nn::{NnError, TensorError};
+use crate::nn::NnError;
 use crate::types::ModelName;
 
 /// Why a prediction failed.
@@ -60,9 +60,6 @@ pub enum ServingError {
         #[source]
         source: FrameError,
     },
-    /// The prediction's tensors could not be built.
-    #[error("the input's tensors could not be built")]
-    Tensor(#[source] Arc<TensorError>),
     /// The thread that owns the models could not be started.
     #[error("could not start the predictor's thread")]
     Thread(#[source] std::io::Error),
@@ -74,9 +71,7 @@ impl HasErrorKind for ServingError {
             Self::UnknownModel { .. } => ErrorKind::NotFound,
             Self::Input(_) => ErrorKind::Usage,
             Self::QueueFull { .. } | Self::Deadline { .. } | Self::Stopped => ErrorKind::Busy,
-            Self::Panicked | Self::Model { .. } | Self::Frame { .. } | Self::Tensor(_) | Self::Thread(_) => {
-                ErrorKind::Internal
-            }
+            Self::Panicked | Self::Model { .. } | Self::Frame { .. } | Self::Thread(_) => ErrorKind::Internal,
         }
     }
 }

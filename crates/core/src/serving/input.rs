@@ -5,9 +5,8 @@ use super::error::InputError;
 use super::ranges::range_warnings;
 use super::task::{Task, check_frames};
 use crate::frame::Frame;
-use crate::nn::ModelSpec;
 use crate::registry::Manifest;
-use crate::types::{Action, ModelName, RobotState};
+use crate::types::{Action, RobotState};
 
 /// The input of a prediction. A model uses the fields that its conditioning names and ignores the others.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -26,47 +25,46 @@ pub struct PredictionInput {
 }
 
 impl PredictionInput {
-    /// Checks that the input fits the model named `model`. Errors name the field, its value and the expected value.
-    pub fn check(&self, model: &ModelName, spec: &ModelSpec) -> Result<(), InputError> {
-        self.checked(model, spec).map(|_| ())
+    /// Checks that the input fits the model. Errors name the field, its value and the expected value.
+    pub fn check(&self, manifest: &Manifest) -> Result<(), InputError> {
+        self.checked(manifest).map(drop)
     }
 
     /// The conditioning input, if the whole input fits the model.
-    fn checked(&self, model: &ModelName, spec: &ModelSpec) -> Result<ConditioningInput, InputError> {
-        check_frames(&self.frames, model, spec)?;
+    fn checked(&self, manifest: &Manifest) -> Result<ConditioningInput, InputError> {
+        check_frames(&self.frames, manifest)?;
         if self.actions.len() > self.frames.len() {
             return Err(InputError::ActionCount {
                 found: self.actions.len(),
                 frames: self.frames.len(),
             });
         }
-        self.conditioning(model, spec)
+        self.conditioning(manifest)
     }
 
     /// The conditioning input of the prediction. Errors name the field, its value and the expected value.
     #[doc(hidden)]
-    pub fn conditioning(&self, model: &ModelName, spec: &ModelSpec) -> Result<ConditioningInput, InputError> {
+    pub fn conditioning(&self, manifest: &Manifest) -> Result<ConditioningInput, InputError> {
         let raw = RawConditioning {
             past: &self.actions,
             plan: self.plan.as_deref(),
             state: self.state.as_ref(),
             steps: self.steps,
         };
-        ConditioningInput::new(raw, &REQUEST_FIELDS, model, spec)
+        ConditioningInput::new(raw, &REQUEST_FIELDS, manifest)
     }
 
     /// What in the input is out of the range that the model saw in training; nothing if the manifest has no ranges.
     /// Errors: as [`PredictionInput::check`].
     pub fn warnings(&self, manifest: &Manifest) -> Result<Vec<String>, InputError> {
-        let conditioning = self.conditioning(&manifest.name, &manifest.spec)?;
-        Ok(range_warnings(manifest, &[conditioning]))
+        Ok(range_warnings(manifest, &[self.conditioning(manifest)?]))
     }
 
     /// The input as a task with one rollout. Errors: as [`PredictionInput::check`].
     #[doc(hidden)]
-    pub fn into_task(self, model: &ModelName, spec: &ModelSpec) -> Result<Task, InputError> {
+    pub fn into_task(self, manifest: &Manifest) -> Result<Task, InputError> {
         Ok(Task {
-            conditioning_inputs: vec![self.checked(model, spec)?],
+            conditioning_inputs: vec![self.checked(manifest)?],
             frames: self.frames,
             ..Task::default()
         })

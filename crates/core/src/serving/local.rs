@@ -4,49 +4,30 @@ use std::sync::Arc;
 
 use super::compute;
 use super::conditioning::{ConditioningInput, REQUEST_FIELDS, RawConditioning};
-use super::error::{InputError, ServingError};
+use super::error::ServingError;
 use super::input::PredictionInput;
 use super::prediction::Rollout;
 use super::ranges::range_warnings;
 use super::session::{SessionSnapshot, SessionState, SnapshotError};
 use super::task::{Task, check_size};
 use crate::frame::Frame;
-use crate::registry::{Manifest, Model};
+use crate::registry::Model;
 use crate::types::{Action, RobotState};
 
 /// The predicted frames of each input, in order, computed as one batch. Errors: `Input` if one does not fit the model,
-/// `Model`, `Tensor`, `Frame`.
+/// `Model`, `Frame`.
 pub fn predict(loaded: &Model, inputs: &[&PredictionInput]) -> Result<Vec<Rollout>, ServingError> {
     let tasks = inputs
         .iter()
-        .map(|input| Ok((*input).clone().into_task(&loaded.manifest.name, loaded.spec())?))
+        .map(|input| Ok((*input).clone().into_task(&loaded.manifest)?))
         .collect::<Result<Vec<Task>, ServingError>>()?;
-    let predictions = compute::run(loaded, &tasks.iter().collect::<Vec<_>>())?;
-    Ok(predictions
-        .into_iter()
-        .flat_map(|prediction| prediction.rollouts)
-        .collect())
+    rollouts(loaded, &tasks)
 }
 
-impl ConditioningInput {
-    /// The conditioning input of one prediction. `plan` holds one action for each predicted frame; the first
-    /// acts from the last frame to the first predicted one. A model ignores what it does not take. Errors name the field,
-    /// its value and the expected value.
-    pub fn for_model(loaded: &Model, plan: Option<&[Action]>, state: Option<&RobotState>) -> Result<Self, InputError> {
-        let raw = RawConditioning {
-            past: &[],
-            plan,
-            state,
-            steps: None,
-        };
-        Self::new(raw, &REQUEST_FIELDS, &loaded.manifest.name, loaded.spec())
-    }
-
-    /// What is out of the range that the model saw in training; nothing if its manifest has no ranges.
-    #[must_use]
-    pub fn warnings(&self, manifest: &Manifest) -> Vec<String> {
-        range_warnings(manifest, std::slice::from_ref(self))
-    }
+/// The rollouts of all tasks, in order.
+fn rollouts(loaded: &Model, tasks: &[Task]) -> Result<Vec<Rollout>, ServingError> {
+    let predictions = compute::run(loaded, &tasks.iter().collect::<Vec<_>>())?.into_iter();
+    Ok(predictions.flat_map(|prediction| prediction.rollouts).collect())
 }
 
 /// A stream of frames with one model, on the caller's own thread. Each frame is encoded once: the session keeps the features
@@ -69,7 +50,7 @@ impl Session {
 
     /// Continues an exported session. Errors: what of the snapshot does not fit the model.
     pub fn restore(model: Arc<Model>, snapshot: SessionSnapshot) -> Result<Self, SnapshotError> {
-        let state = SessionState::restore(snapshot, &model.manifest.name, model.spec())?;
+        let state = SessionState::restore(snapshot, &model.manifest)?;
         Ok(Self { model, state })
     }
 
@@ -83,20 +64,21 @@ impl Session {
         state: Option<&RobotState>,
         plan: Option<&[Action]>,
     ) -> Result<Option<Rollout>, ServingError> {
-        let conditioning = ConditioningInput::for_model(&self.model, plan, state)?;
-        let spec = self.model.spec();
-        check_size(
-            "frame",
-            &self.model.manifest.name,
-            spec,
-            (frame.width(), frame.height()),
-        )?;
-        let task = self.state.step(frame, Some(conditioning.clone()), spec);
+        let manifest = &self.model.manifest;
+        let raw = RawConditioning {
+            past: &[],
+            plan,
+            state,
+            steps: None,
+        };
+        let conditioning = ConditioningInput::new(raw, &REQUEST_FIELDS, manifest)?;
+        check_size("frame", manifest, (frame.width(), frame.height()))?;
+        let task = self.state.step(frame, Some(conditioning.clone()), &manifest.spec);
         let mut predictions = compute::run(&self.model, &[&task])?;
         let prediction = predictions.pop().expect("a task without a prediction is a bug");
         let seq = self.state.next_seq();
         for features in prediction.features {
-            self.state.advance(seq, features, conditioning.clone(), spec);
+            self.state.advance(seq, features, conditioning.clone(), &manifest.spec);
         }
         Ok(prediction.rollouts.into_iter().next())
     }
@@ -104,26 +86,21 @@ impl Session {
     /// Predicts one rollout for each plan from the last frame and state: one action for each frame to predict, the same
     /// number in all plans. Empty until the context is full. Errors: `Input` if a plan does not fit the model.
     pub fn rollouts(&self, plans: Vec<Vec<Action>>) -> Result<Vec<Rollout>, ServingError> {
-        let spec = self.model.spec();
         // Also while there is no state to predict from.
-        if plans.is_empty() || self.state.frame_count() < spec.context {
+        if plans.is_empty() || self.state.frame_count() < self.model.spec().context {
             return Ok(Vec::new());
         }
         let steps = plans.first().map(Vec::len);
         let state = self.state.robot_state().cloned();
-        let inputs = ConditioningInput::of_plans(plans, state, steps, &self.model.manifest.name, spec)?;
-        let mut predictions = compute::run(&self.model, &[&self.state.rollout_task(inputs)])?;
-        Ok(predictions
-            .pop()
-            .map(|prediction| prediction.rollouts)
-            .unwrap_or_default())
+        let inputs = ConditioningInput::of_plans(plans, state, steps, &self.model.manifest)?;
+        rollouts(&self.model, &[self.state.rollout_task(inputs)])
     }
 
     /// What of the last state and actions was out of the range that the model saw in training; nothing if its manifest has
     /// no ranges.
     #[must_use]
     pub fn warnings(&self) -> Vec<String> {
-        self.state.conditioning().warnings(&self.model.manifest)
+        range_warnings(&self.model.manifest, std::slice::from_ref(&self.state.conditioning))
     }
 
     /// What another program or server needs to continue the session.

@@ -30,10 +30,8 @@ impl Prediction {
     /// For each predicted frame of a rollout, whether it is beyond the model's horizon; empty if none is.
     #[must_use]
     pub fn beyond_training(&self) -> Vec<bool> {
-        let (frames, horizon) = (
-            self.rollouts.first().map_or(0, |rollout| rollout.frames.len()),
-            self.manifest.spec.horizon,
-        );
+        let frames = self.rollouts.first().map_or(0, |rollout| rollout.frames.len());
+        let horizon = self.manifest.spec.horizon;
         if frames <= horizon {
             return Vec::new();
         }

@@ -106,7 +106,7 @@ impl Predictor {
     /// Errors: `UnknownModel`, `Input`, `QueueFull`, `Deadline`, `Stopped`, and the errors of the computation.
     pub async fn predict(&self, model: &str, input: PredictionInput) -> Result<Prediction, ServingError> {
         let model = self.active(model)?;
-        let task = input.into_task(&model.manifest.name, &model.manifest.spec)?;
+        let task = input.into_task(&model.manifest)?;
         self.compute(&model, task, None).await
     }
 
@@ -148,14 +148,14 @@ impl Predictor {
             session,
             accepted: Instant::now(),
             deadline,
-            limit: self.shared.deadline,
             reply,
         })?;
         match tokio::time::timeout_at(deadline.into(), answer).await {
             Ok(Ok(answer)) => answer,
             Ok(Err(_)) if self.shared.queue.is_closed() => Err(ServingError::Stopped),
-            Ok(Err(_)) => Err(ServingError::Panicked),
-            Err(_) => Err(ServingError::Deadline {
+            // The queue drops a task after its deadline, the thread one whose computation panicked.
+            Ok(Err(_)) if Instant::now() < deadline => Err(ServingError::Panicked),
+            _ => Err(ServingError::Deadline {
                 limit_ms: self.shared.deadline.as_millis(),
             }),
         }
@@ -208,9 +208,9 @@ mod tests {
     }
 
     fn task(model: &Model) -> Task {
-        let input = worker::blank_input(&model).unwrap();
+        let input = worker::blank_input(model);
         Task {
-            conditioning_inputs: vec![input.conditioning(&model.manifest.name, model.spec()).unwrap()],
+            conditioning_inputs: vec![input.conditioning(&model.manifest).unwrap()],
             frames: input.frames,
             ..Task::default()
         }

@@ -3,7 +3,7 @@
 use std::collections::VecDeque;
 use std::sync::mpsc::SyncSender;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use tokio::sync::oneshot;
 
@@ -25,8 +25,6 @@ pub(super) struct QueuedTask {
     pub(super) session: Option<u64>,
     pub(super) accepted: Instant,
     pub(super) deadline: Instant,
-    /// The whole time limit of the request, for the error message.
-    pub(super) limit: Duration,
     pub(super) reply: oneshot::Sender<Result<Prediction, ServingError>>,
 }
 
@@ -155,14 +153,8 @@ impl QueueState {
             if choice.batch.binary_search(&position).is_ok() {
                 batch.push(waiting);
             } else if choice.discard.binary_search(&position).is_ok() {
-                let limit_ms = waiting.limit.as_millis();
-                meter::record_refusal(if waiting.reply.is_closed() {
-                    "abandoned"
-                } else {
-                    "deadline"
-                });
-                // The receiver is gone if the client has disconnected.
-                let _ = waiting.reply.send(Err(ServingError::Deadline { limit_ms }));
+                let is_abandoned = waiting.reply.is_closed();
+                meter::record_refusal(if is_abandoned { "abandoned" } else { "deadline" });
             } else {
                 remaining.push_back(waiting);
             }
@@ -175,6 +167,8 @@ impl QueueState {
 
 #[cfg(test)]
 mod tests {
+    use std::time::Duration;
+
     use super::*;
     use crate::serving::test_model;
 
@@ -189,7 +183,6 @@ mod tests {
             session: None,
             accepted,
             deadline: accepted + Duration::from_mins(1),
-            limit: Duration::from_mins(1),
             reply,
         };
         (waiting, answer)

@@ -10,7 +10,8 @@ use super::error::InputError;
 use super::task::{Features, Task};
 use crate::frame::Frame;
 use crate::nn::ModelSpec;
-use crate::types::{Action, ModelName, RobotState};
+use crate::registry::Manifest;
+use crate::types::{Action, RobotState};
 
 /// Why an imported session state does not fit the model.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
@@ -82,12 +83,14 @@ pub struct SessionSnapshot {
 pub struct SessionState {
     next_seq: u64,
     features: VecDeque<Features>,
-    conditioning: ConditioningInput,
+    /// The last one.
+    pub(super) conditioning: ConditioningInput,
 }
 
 impl SessionState {
-    /// Restores an exported state for the model named `model`. Errors name the field that does not fit.
-    pub fn restore(snapshot: SessionSnapshot, model: &ModelName, spec: &ModelSpec) -> Result<Self, SnapshotError> {
+    /// Restores an exported state for the model. Errors name the field that does not fit.
+    pub fn restore(snapshot: SessionSnapshot, manifest: &Manifest) -> Result<Self, SnapshotError> {
+        let spec = &manifest.spec;
         let frames = snapshot.features.len();
         if frames > spec.context {
             return Err(SnapshotError::FrameCount {
@@ -104,19 +107,15 @@ impl SessionState {
         for (index, features) in snapshot.features.iter().enumerate() {
             check_features(index, features, spec)?;
         }
+        let raw = RawConditioning {
+            past: &[],
+            plan: Some(&snapshot.actions),
+            state: snapshot.state.as_ref(),
+            steps: snapshot.steps,
+        };
         let conditioning = match frames {
             0 => ConditioningInput::default(),
-            _ => ConditioningInput::new(
-                RawConditioning {
-                    past: &[],
-                    plan: Some(&snapshot.actions),
-                    state: snapshot.state.as_ref(),
-                    steps: snapshot.steps,
-                },
-                &SNAPSHOT_FIELDS,
-                model,
-                spec,
-            )?,
+            _ => ConditioningInput::new(raw, &SNAPSHOT_FIELDS, manifest)?,
         };
         Ok(Self {
             next_seq: snapshot.next_seq,
@@ -147,11 +146,6 @@ impl SessionState {
     #[must_use]
     pub fn frame_count(&self) -> usize {
         self.features.len()
-    }
-
-    /// The last conditioning input.
-    pub(super) fn conditioning(&self) -> &ConditioningInput {
-        &self.conditioning
     }
 
     /// The robot's state at the last frame, if the model takes it.
@@ -215,12 +209,12 @@ fn check_features(index: usize, features: &[f32], spec: &ModelSpec) -> Result<()
         });
     }
     // Features are outputs of tanh, or pixels for the flow network; NaN is in no range.
-    match features
-        .iter()
-        .enumerate()
-        .find(|(_, value)| !(-1.0..=1.0).contains(*value))
-    {
-        Some((place, &value)) => Err(SnapshotError::Feature { index, place, value }),
+    match features.iter().position(|value| !(-1.0..=1.0).contains(value)) {
+        Some(place) => Err(SnapshotError::Feature {
+            index,
+            place,
+            value: features[place],
+        }),
         None => Ok(()),
     }
 }
@@ -256,7 +250,7 @@ mod tests {
                 && snapshot.features.iter().all(|f| f.len() == 5 && f.iter().all(|value| value.abs() <= 1.0))
                 && (snapshot.features.is_empty() == (next_seq == 0) && next_seq >= snapshot.features.len() as u64)
                 && (snapshot.features.is_empty() || (snapshot.actions.len() == 2 && snapshot.state.is_some()));
-            match SessionState::restore(snapshot.clone(), &model.manifest.name, model.spec()) {
+            match SessionState::restore(snapshot.clone(), &model.manifest) {
                 Ok(restored) => {
                     prop_assert!(is_sound);
                     if next_seq > 0 {
@@ -279,7 +273,7 @@ mod tests {
             steps: None,
         };
         snapshot.features[0][3] = f32::NAN;
-        let error = SessionState::restore(snapshot, &model.manifest.name, model.spec()).unwrap_err();
+        let error = SessionState::restore(snapshot, &model.manifest).unwrap_err();
         assert_eq!(
             error.to_string(),
             "snapshot.features[0][3] is NaN; a feature is -1 to 1"

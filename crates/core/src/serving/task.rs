@@ -5,8 +5,7 @@ use std::sync::Arc;
 use super::conditioning::ConditioningInput;
 use super::error::InputError;
 use crate::frame::Frame;
-use crate::nn::ModelSpec;
-use crate::types::ModelName;
+use crate::registry::Manifest;
 
 /// The features of one frame, `[F]`.
 pub type Features = Arc<[f32]>;
@@ -27,10 +26,9 @@ impl Task {
     pub fn rollout(
         frames: Vec<Frame>,
         conditioning_inputs: Vec<ConditioningInput>,
-        model: &ModelName,
-        spec: &ModelSpec,
+        manifest: &Manifest,
     ) -> Result<Self, InputError> {
-        check_frames(&frames, model, spec)?;
+        check_frames(&frames, manifest)?;
         Ok(Self {
             frames,
             conditioning_inputs,
@@ -53,41 +51,33 @@ impl Task {
 }
 
 /// Checks that the frames fill the model's context and have its size.
-pub(super) fn check_frames(frames: &[Frame], model: &ModelName, spec: &ModelSpec) -> Result<(), InputError> {
-    if frames.len() != spec.context {
+pub(super) fn check_frames(frames: &[Frame], manifest: &Manifest) -> Result<(), InputError> {
+    if frames.len() != manifest.spec.context {
         return Err(InputError::FrameCount {
-            model: model.clone(),
+            model: manifest.name.clone(),
             found: frames.len(),
-            expected: spec.context,
+            expected: manifest.spec.context,
         });
     }
     for (index, frame) in frames.iter().enumerate() {
-        check_size(
-            &format!("frames[{index}]"),
-            model,
-            spec,
-            (frame.width(), frame.height()),
-        )?;
+        let field = format!("frames[{index}]");
+        check_size(&field, manifest, (frame.width(), frame.height()))?;
     }
     Ok(())
 }
 
 /// Checks that the frame in `field` has the model's width and height in pixels.
-pub fn check_size(
-    field: &str,
-    model: &ModelName,
-    spec: &ModelSpec,
-    (width, height): (u32, u32),
-) -> Result<(), InputError> {
-    if (width, height) == (spec.frame_width_px, spec.frame_height_px) {
+pub fn check_size(field: &str, manifest: &Manifest, (width, height): (u32, u32)) -> Result<(), InputError> {
+    let (model_width, model_height) = (manifest.spec.frame_width_px, manifest.spec.frame_height_px);
+    if (width, height) == (model_width, model_height) {
         return Ok(());
     }
     Err(InputError::FrameSize {
         field: field.to_owned(),
-        model: model.clone(),
+        model: manifest.name.clone(),
         width,
         height,
-        model_width: spec.frame_width_px,
-        model_height: spec.frame_height_px,
+        model_width,
+        model_height,
     })
 }

@@ -85,28 +85,24 @@ fn load_model(ModelLoad { model, reply }: ModelLoad, catalog: &Catalog) {
 /// Predicts once from black frames, to warm up memory and caches.
 fn warm_up(model: &Model) -> Result<(), ServingError> {
     let started = Instant::now();
-    local::predict(model, &[&blank_input(model)?])?;
+    local::predict(model, &[&blank_input(model)])?;
     let warm_up_us = micros_since(started);
     info!(model.id = %model.manifest.name, warm_up_us, "first prediction made");
     Ok(())
 }
 
 /// Black frames, with actions and a state of zeros.
-pub(super) fn blank_input(model: &Model) -> Result<PredictionInput, ServingError> {
+pub(super) fn blank_input(model: &Model) -> PredictionInput {
     let spec = model.spec();
-    let pixels = vec![0; spec.frame_width_px as usize * spec.frame_height_px as usize];
-    let frame =
-        Frame::new(spec.frame_width_px, spec.frame_height_px, pixels).map_err(|source| ServingError::Frame {
-            model: model.manifest.name.clone(),
-            source,
-        })?;
-    Ok(PredictionInput {
+    let frame = Frame::new(spec.frame_width_px, spec.frame_height_px, vec![0; spec.pixels()]);
+    let frame = frame.expect("a model with frames that are too large is a bug");
+    PredictionInput {
         frames: vec![frame; spec.context],
         actions: Action::try_from(vec![0.0; spec.actions.len()]).into_iter().collect(),
         state: RobotState::try_from(vec![0.0; spec.states.len()]).ok(),
         plan: None,
         steps: None,
-    })
+    }
 }
 
 fn answer(batch: Vec<QueuedTask>) {

@@ -9,7 +9,6 @@ use super::check::{check_description, check_episode};
 use super::frame_store::frame_file::FrameFile;
 use super::frame_store::{FrameContent, FrameStore};
 use super::{DatasetError, DatasetInfo, Episode, EpisodeData};
-use foreframe_core::files::hex;
 use foreframe_core::frame::Frame;
 
 /// An open data set.
@@ -110,7 +109,7 @@ impl Dataset {
         for value in &self.timestamps_s {
             hasher.update(value.to_le_bytes());
         }
-        Ok(hex(&hasher.finalize()))
+        Ok(format!("{:x}", hasher.finalize()))
     }
 
     /// The description of the data set.

@@ -14,7 +14,7 @@ use sha2::{Digest as _, Sha256};
 
 use super::{DATABASE_FILE, Store, StoreError, WRITE_PROBE, unix_s};
 use foreframe_core::error_kind::{ErrorKind, HasErrorKind};
-use foreframe_core::files::{files_below, hex, is_hidden, is_partial, none_if_missing, write_atomically};
+use foreframe_core::files::{files_below, is_hidden, is_partial, none_if_missing, write_atomically};
 
 /// The list of files in a backup. It is written last, so a directory without it is no backup.
 const INDEX_FILE: &str = "backup.json";
@@ -267,7 +267,7 @@ pub(super) fn copy(from: &Path, to: &Path) -> io::Result<BackupFile> {
 fn hash(path: &Path) -> io::Result<BackupFile> {
     let mut digest = Sha256::new();
     let bytes = io::copy(&mut File::open(path)?, &mut digest)?;
-    let sha256 = hex(&digest.finalize());
+    let sha256 = format!("{:x}", digest.finalize());
     Ok(BackupFile { bytes, sha256 })
 }
 

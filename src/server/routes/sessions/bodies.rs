@@ -138,7 +138,7 @@ impl CreateSession {
             format: format.or(exported.format.map(ImageFormat::answer)),
             resize: resize.or(exported.resize),
         };
-        let state = SessionState::restore(exported.snapshot, &manifest.name, &manifest.spec)
+        let state = SessionState::restore(exported.snapshot, manifest)
             .map_err(|error| ApiError::Unprocessable(format!("state.{error}")))?;
         Ok((model, state, settings))
     }

@@ -8,7 +8,7 @@ use flate2::read::MultiGzDecoder;
 use sha2::{Digest, Sha256};
 
 use crate::dataset::{DatasetError, Split};
-use foreframe_core::files::{files_below, hex};
+use foreframe_core::files::files_below;
 use foreframe_core::frame::codec;
 use foreframe_sim::moving_digits::{DIGIT_PIXELS, DIGIT_SIDE_PX};
 
@@ -79,7 +79,7 @@ impl DigitPools {
             hasher.update((pool.len() as u64).to_le_bytes());
             hasher.update(pool.as_flattened());
         }
-        hex(&hasher.finalize())
+        format!("{:x}", hasher.finalize())
     }
 }
 

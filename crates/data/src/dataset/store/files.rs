@@ -8,7 +8,7 @@ use serde::Serialize;
 use sha2::{Digest, Sha256};
 
 use crate::dataset::error::DatasetError;
-use foreframe_core::files::{self, hex, is_partial_of};
+use foreframe_core::files::{self, is_partial_of};
 
 /// Writes a file atomically. Creates its directory if it is missing. Errors: `Io`.
 pub(crate) fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), DatasetError> {
@@ -77,7 +77,7 @@ pub(crate) fn sha256_of_file(path: &Path) -> Result<String, DatasetError> {
     File::open(path)
         .and_then(|mut file| io::copy(&mut file, &mut hasher))
         .map_err(DatasetError::io("read", path))?;
-    Ok(hex(&hasher.finalize()))
+    Ok(format!("{:x}", hasher.finalize()))
 }
 
 /// Errors: `HashDiffers` unless the file has this SHA-256 (hexadecimal).
