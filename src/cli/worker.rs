@@ -12,6 +12,7 @@ use super::settings::{CommonArgs, open_store_waiting, with_checked_directories};
 use crate::config::Config;
 use crate::server::{serve_worker_health, start_jobs};
 use crate::telemetry::{self, LogFormat};
+use foreframe_jobs::jobs::child;
 use foreframe_jobs::versions::Versions;
 
 /// Run jobs without serving.

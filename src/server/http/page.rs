@@ -19,7 +19,7 @@ pub(in crate::server) struct Page {
     /// The maximum number of entries, 1 to 1000. Default: 100.
     #[serde(default)]
     #[param(minimum = 1, maximum = 1000)]
-    pub(in crate::server) limit: Option<usize>,
+    limit: Option<usize>,
 }
 
 impl Page {
@@ -34,7 +34,7 @@ impl Page {
         all: impl IntoIterator<Item = T>,
         key: impl Fn(&T) -> &str,
     ) -> Result<(Vec<T>, Option<String>), ApiError> {
-        let limit = checked_limit(self.limit)?;
+        let limit = self.limit()?;
         let mut rest = all.into_iter().filter(|entry| key(entry) > self.after.as_str());
         let page: Vec<T> = rest.by_ref().take(limit).collect();
         let next = rest.next().and_then(|_| page.last().map(|last| key(last).to_owned()));

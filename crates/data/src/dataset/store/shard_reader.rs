@@ -215,7 +215,10 @@ impl<'a> Column<'a> {
     /// The encoded images of a column without null values. Errors: `Corrupt`.
     pub(crate) fn images(&self, key: &str) -> Result<impl Iterator<Item = &'a [u8]> + use<'a>, DatasetError> {
         let images = self.cast(key, "images", |column| {
-            let bytes = column.as_struct_opt()?.column_by_name("bytes")?.as_binary_opt::<i32>()?;
+            let bytes = column
+                .as_struct_opt()?
+                .column_by_name("bytes")?
+                .as_binary_opt::<i32>()?;
             (bytes.null_count() == 0).then_some(bytes)
         })?;
         Ok(images.iter().flatten())

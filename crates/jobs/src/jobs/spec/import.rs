@@ -95,21 +95,18 @@ impl ImportSpec {
     pub(super) fn check(&self, available: AvailableInputs<'_>) -> Result<(), JobError> {
         let config = self.config(available.data_dir, available.import_dir)?;
         if available.datasets.contains(&self.name) {
-            return Err(JobError::Taken {
-                name: self.name.clone(),
-                why: "exists",
-            });
+            return Err(JobError::taken(&self.name, "exists; choose another name"));
         }
         // With a shared object store, a data set that is complete only here was deleted elsewhere or not yet pushed.
         if is_finished(&config.out) {
             return Ok(());
         }
         check_out(&config).map_err(|error| match error {
-            ImportError::OutExists { what, .. } => JobError::Occupied {
-                name: self.name.clone(),
-                why: format!("cannot be written because its directory holds {what}"),
-            },
-            other => invalid("source", error_text::with_causes(&other)),
+            ImportError::OutExists { what, .. } => JobError::taken(
+                &self.name,
+                format!("cannot be written because its directory holds {what}, or choose another name"),
+            ),
+            other => JobError::invalid("source", error_text::with_causes(&other)),
         })
     }
 
@@ -118,11 +115,11 @@ impl ImportSpec {
     pub(in crate::jobs) fn config(&self, data_dir: &Path, import_dir: Option<&Path>) -> Result<ImportConfig, JobError> {
         let Some(import_dir) = import_dir else {
             let why = "imports are off on this server; set its setting import_dir to the directory with the recordings";
-            return Err(invalid("source", why.to_owned()));
+            return Err(JobError::invalid("source", why.to_owned()));
         };
         let root = import_dir.canonicalize().map_err(|error| {
             let why = format!("the server's import_dir cannot be read ({error}); create it, or correct the setting");
-            invalid("source", why)
+            JobError::invalid("source", why)
         })?;
         let source = existing(&root, &self.source, "source")?;
         check_links(&root, &source)?;
@@ -137,7 +134,8 @@ impl ImportSpec {
 
     /// The options. Errors: `Invalid`, which names the field.
     fn options(&self, csv: Option<PathBuf>) -> Result<ImportOptions, JobError> {
-        let wrong = |option, value: &str, right: &str| invalid(option, format!("{value} is not valid; {right}"));
+        let wrong =
+            |option, value: &str, right: &str| JobError::invalid(option, format!("{value} is not valid; {right}"));
         let size = parse_size(&self.size);
         let (frame_width_px, frame_height_px) =
             size.map_err(|right| wrong("size", &format!("\"{}\"", self.size.escape_default()), right))?;
@@ -159,19 +157,15 @@ impl ImportSpec {
         match options.validate() {
             Ok(()) => Ok(options),
             Err(ImportError::OptionValue { option, value, right }) => Err(wrong(option, &value, &right)),
-            Err(other) => Err(invalid("source", other.to_string())),
+            Err(other) => Err(JobError::invalid("source", other.to_string())),
         }
     }
-}
-
-fn invalid(field: &'static str, reason: String) -> JobError {
-    JobError::Invalid { field, reason }
 }
 
 fn wrong_path(field: &'static str, path: &str, what: &str) -> JobError {
     let path = path.escape_default();
     let right = "give the path of a recording below the server's import_dir, as in mycar/data";
-    invalid(field, format!("\"{path}\" {what}; {right}"))
+    JobError::invalid(field, format!("\"{path}\" {what}; {right}"))
 }
 
 /// The real path of a file or folder below `root`, which is a real path itself. Errors: `Invalid`.
@@ -196,7 +190,7 @@ fn check_links(root: &Path, source: &Path) -> Result<(), JobError> {
             continue;
         }
         let unreadable =
-            |error: io::Error| invalid("source", format!("{} cannot be read: {error}", shown(root, &folder)));
+            |error: io::Error| JobError::invalid("source", format!("{} cannot be read: {error}", shown(root, &folder)));
         for entry in fs::read_dir(&folder).map_err(unreadable)? {
             let entry = entry.map_err(unreadable)?;
             let kind = entry.file_type().map_err(unreadable)?;
