@@ -1,6 +1,6 @@
 //! Persistent state: rows in a database ([`jobs`] with their [`reports`], [`models`], [`keys`], [`audit`]) and files in
 //! [`objects`]. [`backup`] copies both.
-//! Only `database` knows that there are two kinds of database. SQL is only in this module.
+//! Only `database` knows that there are two kinds of database; `sqlite` opens the embedded one. SQL is only in this module.
 
 pub mod audit;
 pub mod backup;

@@ -175,7 +175,9 @@ fn push<T>(waiting: &mut VecDeque<T>, item: T) {
 
 fn prepend<T>(waiting: &mut VecDeque<T>, items: Vec<T>) {
     let later = std::mem::replace(waiting, items.into());
-    later.into_iter().for_each(|item| push(waiting, item));
+    for item in later {
+        push(waiting, item);
+    }
 }
 
 #[cfg(test)]

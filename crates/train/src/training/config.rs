@@ -269,12 +269,11 @@ pub struct RunConfig {
 }
 
 impl RunConfig {
-    /// The optimizer's constants.
+    /// The optimizer's settings.
     pub(super) fn optimizer(&self) -> OptimizerConfig {
         OptimizerConfig {
             rule: self.optimizer,
             clip_norm: self.clip_norm,
-            ..OptimizerConfig::default()
         }
     }
 }
