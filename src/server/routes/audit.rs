@@ -38,7 +38,7 @@ struct AuditQuery {
 
 /// Who changed what and when, the newest first. Needs the scope `admin`.
 #[utoipa::path(
-    get, path = "/v1/audit", tag = "about", operation_id = "audit",
+    get, path = "/v1/audit", tag = "about", operation_id = "audit", params(AuditQuery),
     responses(
         (status = 200, body = AuditList),
         (status = 422, description = "A number is out of range"),

@@ -78,7 +78,7 @@ struct DatasetDescription {
 
 /// Lists the finished data sets.
 #[utoipa::path(
-    get, path = "/v1/datasets",
+    get, path = "/v1/datasets", params(Page),
     responses((status = 200, body = DatasetList), (status = 422, description = "A limit out of range"))
 )]
 async fn list(app: App, Query(page): Query<Page>) -> Result<axum::Json<DatasetList>, ApiError> {

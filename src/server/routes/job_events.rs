@@ -45,7 +45,10 @@ struct JobEvent {
 /// server stops, or the API key is revoked. With `Last-Event-ID`, the log continues after that line.
 #[utoipa::path(
     get, path = "/v1/jobs/{id}/events",
-    params(("Last-Event-ID" = Option<String>, Header, description = "The number of the last line of the log that was received")),
+    params(
+        ("id" = String, Path),
+        ("Last-Event-ID" = Option<String>, Header, description = "The number of the last line of the log that was received"),
+    ),
     responses(
         (status = 200, description = "Events", content_type = "text/event-stream", body = JobEvent),
         (status = 503, description = "Too many event streams are open"),

@@ -123,7 +123,7 @@ async fn create(
 
 /// Lists jobs, the newest first.
 #[utoipa::path(
-    get, path = "/v1/jobs",
+    get, path = "/v1/jobs", params(ListQuery),
     responses((status = 200, body = JobList), (status = 422, description = "No such kind or state"))
 )]
 async fn list(app: App, Query(query): Query<ListQuery>) -> Result<axum::Json<JobList>, ApiError> {
@@ -167,7 +167,10 @@ async fn resume(app: App, author: Author, Path(id): Path<String>) -> Result<impl
 }
 
 /// The log of a job.
-#[utoipa::path(get, path = "/v1/jobs/{id}/logs", responses((status = 200, body = Log)))]
+#[utoipa::path(
+    get, path = "/v1/jobs/{id}/logs", params(("id" = String, Path), LogQuery),
+    responses((status = 200, body = Log))
+)]
 async fn logs(app: App, Path(id): Path<String>, Query(query): Query<LogQuery>) -> Result<axum::Json<Log>, ApiError> {
     let limit = page::checked_limit(query.limit, page::MAX_LIMIT)?;
     let lines = app.jobs().log(job_id(&id)?, query.after.unwrap_or(0), limit).await?;

@@ -110,7 +110,7 @@ impl ModelDescription {
 
 /// Lists the loaded models.
 #[utoipa::path(
-    get, path = "/v1/models",
+    get, path = "/v1/models", params(Page),
     responses((status = 200, body = ModelList), (status = 422, description = "A limit out of range"))
 )]
 async fn list(app: App, Query(page): Query<Page>) -> Result<axum::Json<ModelList>, ApiError> {

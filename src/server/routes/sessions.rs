@@ -56,7 +56,7 @@ async fn create(app: App, caller: Caller, Json(request): Json<CreateSession>) ->
 
 /// Lists the open sessions that this key opened; with the scope `admin`, those of all keys.
 #[utoipa::path(
-    get, path = "/v1/sessions",
+    get, path = "/v1/sessions", params(Page),
     responses((status = 200, body = SessionList), (status = 422, description = "A limit out of range"))
 )]
 async fn list(app: App, caller: Caller, Query(page): Query<Page>) -> Result<axum::Json<SessionList>, ApiError> {
