@@ -98,7 +98,7 @@ impl ConnectionHandler {
                 }
             }
             #[cfg(not(feature = "tls"))]
-            Some(never) => match never {},
+            Some(never) => match never.0 {},
         }
     }
 

@@ -195,8 +195,8 @@ pub(in crate::server) fn last_response(status: StatusCode, slug: &str, detail: &
         _ => String::new(),
     };
     let head = format!(
-        "HTTP/1.1 {status}\r\nConnection: close\r\nContent-Type: {MEDIA_TYPE}\r\nX-Content-Type-Options: nosniff\r\n\
-         {retry_after}Content-Length: {}\r\n\r\n",
+        "HTTP/1.1 {status}\r\n{retry_after}Connection: close\r\nContent-Type: {MEDIA_TYPE}\r\n\
+         X-Content-Type-Options: nosniff\r\nContent-Length: {}\r\n\r\n",
         body.len()
     );
     [head.as_bytes(), &body].concat()

@@ -14,15 +14,12 @@ use crate::server::config::ServerConfig;
 #[error("{0}")]
 pub struct TlsError(String);
 
-/// TLS for the public address. Clones share the certificate.
-#[cfg(feature = "tls")]
+/// TLS for the public address. Clones share the certificate. Without the feature there is none.
 #[derive(Clone)]
-pub struct ServerTls(pub(super) acceptor::TlsAcceptor);
-
-/// There is no TLS without the feature.
-#[cfg(not(feature = "tls"))]
-#[derive(Clone)]
-pub enum ServerTls {}
+pub struct ServerTls(
+    #[cfg(feature = "tls")] pub(super) acceptor::TlsAcceptor,
+    #[cfg(not(feature = "tls"))] pub(super) Infallible,
+);
 
 impl ServerTls {
     /// Reads the files that the settings name; none if they name none.
@@ -54,7 +51,7 @@ impl ServerTls {
             #[cfg(feature = "tls")]
             Some(Self(acceptor)) => acceptor.keep_fresh().await,
             #[cfg(not(feature = "tls"))]
-            Some(never) => match *never {},
+            Some(Self(never)) => match *never {},
         }
     }
 }

@@ -17,11 +17,11 @@ use super::spec::{Architecture, ModelSpec, in_range};
 #[derive(Clone, Debug)]
 pub struct Network {
     spec: ModelSpec,
-    variant: Variant,
+    network: AnyNetwork,
 }
 
 #[derive(Clone, Debug)]
-enum Variant {
+enum AnyNetwork {
     Dense(Box<DenseNetwork>),
     Flow(Box<FlowNetwork>),
 }
@@ -49,11 +49,11 @@ impl Network {
             tensors.insert(name, tensor);
         }
         let tensors = ModelTensors(tensors);
-        let variant = match spec.architecture {
-            Architecture::Dense(sizes) => Variant::Dense(Box::new(DenseNetwork::new(spec.clone(), sizes, &tensors))),
-            Architecture::Flow(sizes) => Variant::Flow(Box::new(FlowNetwork::new(spec.clone(), sizes, &tensors))),
+        let network = match spec.architecture {
+            Architecture::Dense(sizes) => AnyNetwork::Dense(Box::new(DenseNetwork::new(spec.clone(), sizes, &tensors))),
+            Architecture::Flow(sizes) => AnyNetwork::Flow(Box::new(FlowNetwork::new(spec.clone(), sizes, &tensors))),
         };
-        Ok(Self { spec, variant })
+        Ok(Self { spec, network })
     }
 
     /// The same network with a description that may not fit it, to test failures.
@@ -71,18 +71,18 @@ impl Network {
     /// Codes `[N, code_len]` of frames `[N, P]` in the model's space. Errors: `Shape`.
     pub fn encode_frames(&self, frames: &Tensor) -> Result<Tensor, NnError> {
         self.check("frames", frames, &[None, Some(self.spec.pixels())])?;
-        match &self.variant {
-            Variant::Dense(dense) => dense.encode_frames(frames),
-            Variant::Flow(_) => Ok(frames.clone()),
+        match &self.network {
+            AnyNetwork::Dense(dense) => dense.encode_frames(frames),
+            AnyNetwork::Flow(_) => Ok(frames.clone()),
         }
     }
 
     /// Frames `[N, P]` in the model's space, not clamped, of codes `[N, code_len]`. Errors: `Shape`.
     pub fn decode_frames(&self, codes: &Tensor) -> Result<Tensor, NnError> {
         self.check("features", codes, &[None, Some(self.spec.code_len())])?;
-        match &self.variant {
-            Variant::Dense(dense) => dense.decode_frames(codes),
-            Variant::Flow(_) => Ok(codes.clone()),
+        match &self.network {
+            AnyNetwork::Dense(dense) => dense.decode_frames(codes),
+            AnyNetwork::Flow(_) => Ok(codes.clone()),
         }
     }
 
@@ -98,7 +98,7 @@ impl Network {
         if let Feedback::TeacherForcing(truth) = feedback {
             let shape = [Some(batch), Some(self.spec.horizon), Some(self.spec.code_len())];
             self.check("true features", truth, &shape)?;
-            if let Variant::Dense(dense) = &self.variant {
+            if let AnyNetwork::Dense(dense) = &self.network {
                 return dense.predict_from_truth(codes, conditioning, truth);
             }
         }
@@ -114,9 +114,9 @@ impl Network {
         conditioning: &ConditioningTensors,
     ) -> Result<Tensor, NnError> {
         self.check_windows(codes)?;
-        match &self.variant {
-            Variant::Dense(dense) => dense.predict_rollouts(codes, windows, conditioning),
-            Variant::Flow(flow) => Ok(flow.predict(codes, windows, conditioning, self.spec.horizon)?.frames),
+        match &self.network {
+            AnyNetwork::Dense(dense) => dense.predict_rollouts(codes, windows, conditioning),
+            AnyNetwork::Flow(flow) => Ok(flow.predict(codes, windows, conditioning, self.spec.horizon)?.frames),
         }
     }
 
@@ -135,9 +135,9 @@ impl Network {
             return self.predict_rollouts(codes, windows, conditioning);
         }
         self.check_windows(codes)?;
-        match &self.variant {
-            Variant::Dense(dense) => dense.with_horizon(steps).predict_rollouts(codes, windows, conditioning),
-            Variant::Flow(flow) => flow.predict_beyond_horizon(codes, windows, conditioning, steps),
+        match &self.network {
+            AnyNetwork::Dense(dense) => dense.with_horizon(steps).predict_rollouts(codes, windows, conditioning),
+            AnyNetwork::Flow(flow) => flow.predict_beyond_horizon(codes, windows, conditioning, steps),
         }
     }
 
@@ -151,9 +151,9 @@ impl Network {
     ) -> Result<Option<FlowPrediction>, NnError> {
         let batch = self.check_windows(frames)?;
         in_range("steps", steps as f64, 1.0, self.spec.horizon as f64)?;
-        match &self.variant {
-            Variant::Dense(_) => Ok(None),
-            Variant::Flow(flow) => flow.predict(frames, &each_once(batch), conditioning, steps).map(Some),
+        match &self.network {
+            AnyNetwork::Dense(_) => Ok(None),
+            AnyNetwork::Flow(flow) => flow.predict(frames, &each_once(batch), conditioning, steps).map(Some),
         }
     }
 
@@ -161,9 +161,9 @@ impl Network {
     /// network, which does not reconstruct. Errors: `Shape`.
     pub fn reconstruct(&self, codes: &Tensor) -> Result<Option<Tensor>, NnError> {
         self.check_windows(codes)?;
-        match &self.variant {
-            Variant::Dense(dense) => dense.reconstruct(codes).map(Some),
-            Variant::Flow(_) => Ok(None),
+        match &self.network {
+            AnyNetwork::Dense(dense) => dense.reconstruct(codes).map(Some),
+            AnyNetwork::Flow(_) => Ok(None),
         }
     }
 

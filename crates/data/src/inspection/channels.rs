@@ -54,9 +54,12 @@ pub struct ChannelSummary {
     pub histogram: Histogram,
 }
 
+/// Reads the values of one frame.
+type ValuesOfFrame = fn(&Dataset, usize) -> &[f32];
+
 pub(super) fn of(dataset: &Dataset) -> Vec<ChannelSummary> {
     let info = dataset.info();
-    let groups: [(ChannelRole, &[Channel], fn(&Dataset, usize) -> &[f32]); 2] = [
+    let groups: [(ChannelRole, &[Channel], ValuesOfFrame); 2] = [
         (ChannelRole::Action, &info.action_channels, Dataset::action),
         (ChannelRole::State, &info.state_channels, Dataset::state),
     ];

@@ -270,7 +270,7 @@ mod tests {
         let text = serde_json::to_string(&metadata).unwrap();
         let path = Path::new(METADATA);
         assert!(DatasetMetadata::parse(path, text.as_bytes()).is_ok());
-        let changed = text.replacen("{", "{\"colour\":1,", 1);
+        let changed = text.replacen('{', "{\"colour\":1,", 1);
         let error = DatasetMetadata::parse(path, changed.as_bytes()).err().unwrap();
         assert!(error.to_string().contains("unknown field `colour`"), "{error}");
     }
