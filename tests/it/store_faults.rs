@@ -27,7 +27,7 @@ async fn enqueue(store: &Store) -> Result<EnqueueResult, StoreError> {
     store.enqueue(new, 1_000_000, 0.0).await
 }
 
-/// A mounted file system of a few size_mib.
+/// A mounted file system of a few MiB.
 struct SmallDisk(PathBuf);
 
 impl SmallDisk {

@@ -17,7 +17,8 @@ pub struct AuditRow {
     /// Its number, from 1. The oldest are deleted.
     pub number: i64,
     /// When, in seconds since 1970.
-    #[serde(rename = "unix_s")]
+    #[schema(rename = "unix_s")]
+    #[serde(rename(serialize = "unix_s"))]
     pub time_s: f64,
     /// The id of an API key, `anonymous` (authentication is off) or `command line`.
     pub who: String,

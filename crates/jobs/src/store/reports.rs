@@ -27,7 +27,8 @@ pub struct LogRow {
     /// The number of the line, from 1. The oldest lines are removed.
     pub seq: i64,
     /// Time in seconds since 1970.
-    #[serde(rename = "unix_s")]
+    #[schema(rename = "unix_s")]
+    #[serde(rename(serialize = "unix_s"))]
     pub time_s: f64,
     /// What happened.
     pub line: String,

@@ -28,7 +28,9 @@ const LOGGED_PARTS: usize = 10;
 pub(crate) struct FrameFilePlace {
     /// It contains the content hash, so equal paths mean equal frames.
     path: PathBuf,
-    /// Number of records.
+    /// Number of frames.
+    frames: usize,
+    /// Number of records: frames and masks.
     images: usize,
     /// Pixels of a record.
     image_bytes: usize,
@@ -40,6 +42,7 @@ impl FrameFilePlace {
         let name = format!("frames-{}x{}-{hash}", info.frame_width_px, info.frame_height_px);
         Self {
             path: directory.join(DIRECTORY).join(name),
+            frames: info.frame_count,
             images: info.image_count(),
             image_bytes: info.frame_pixels(),
         }
@@ -185,7 +188,12 @@ impl FrameFile {
         if checksum == crc32fast::hash(&record).to_le_bytes() {
             return Ok(record);
         }
-        let reason = format!("image {image} has another checksum; delete this file, and it is written again");
+        // The masks follow the frames.
+        let damaged = match image.checked_sub(place.frames) {
+            None => format!("frame {image}"),
+            Some(frame) => format!("the mask of frame {frame}"),
+        };
+        let reason = format!("{damaged} has another checksum; delete this file, and it is written again");
         Err(DatasetError::corrupt(&place.path, &reason))
     }
 }
