@@ -57,7 +57,6 @@ pub use foreframe_core::types::{Action, Channel, ModelName, RobotState, Seed, Va
 /// Image files, resizing, and the measures of a prediction's error.
 pub mod images {
     pub use foreframe_core::frame::codec::{decode, encode_png};
-    pub use foreframe_core::frame::jpeg::{JpegDamage, ScanDamage};
     pub use foreframe_core::frame::preprocess::Preprocess;
     pub use foreframe_core::frame::quality::{mse, psnr_db, ssim};
     pub use foreframe_core::frame::resize::{Resize, ResizeError, resize};

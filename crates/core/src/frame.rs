@@ -1,8 +1,6 @@
 //! A gray camera image with a checked size. [`codec`] reads and writes image files, [`preprocess`] converts frames to and
 //! from the model's value range, [`quality`] compares two images, [`resize`](mod@resize) changes the size, [`warp`] moves pixels.
 
-use jpeg::JpegDamage;
-
 mod catmull_rom;
 pub mod codec;
 pub mod jpeg;
@@ -43,7 +41,7 @@ pub enum FrameError {
     Decode(#[source] image::ImageError),
     /// A JPEG image is incomplete, or its data is not valid.
     #[error("a damaged JPEG image: {0}")]
-    Damaged(JpegDamage),
+    Damaged(Box<dyn std::error::Error + Send + Sync>),
     /// An image could not be written.
     #[error("could not encode the image")]
     Encode(#[source] image::ImageError),

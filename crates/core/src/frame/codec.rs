@@ -23,7 +23,7 @@ pub fn decode(bytes: &[u8]) -> Result<Frame, FrameError> {
     }
     // The decoder fills what is missing with gray.
     if bytes.starts_with(&[0xff, 0xd8]) {
-        jpeg::check(bytes).map_err(FrameError::Damaged)?;
+        jpeg::check(bytes).map_err(|damage| FrameError::Damaged(damage.into()))?;
     }
     let pixel_bytes = u64::from(width) * u64::from(height) * MAX_PIXEL_BYTES;
     let image = reader(bytes, pixel_bytes + MAX_METADATA_BYTES)?.decode();
