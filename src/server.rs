@@ -1,4 +1,4 @@
-//! The service over HTTP and WebSocket: [`serve`] answers requests until it is asked to stop. [`App`] is what the
+//! The service over HTTP and WebSocket: `serve` answers requests until it is asked to stop. `App` is what the
 //! handlers share, [`protocol`] the messages of a stream.
 //!
 //! The rooms in the order in which they may use each other; each uses only those before it:

@@ -33,12 +33,12 @@ impl Network {
         Self::with_frozen(spec, parameters, &[])
     }
 
-    /// As [`Model::new`], without any gradients: for prediction.
+    /// As [`Network::new`], without any gradients: for prediction.
     pub fn detached(spec: ModelSpec, parameters: &Parameters) -> Result<Self, NnError> {
         Self::with_frozen(spec, parameters, &[""])
     }
 
-    /// As [`Model::new`], without gradients for tensors whose name starts with one of the prefixes.
+    /// As [`Network::new`], without gradients for tensors whose name starts with one of the prefixes.
     pub fn with_frozen(spec: ModelSpec, parameters: &Parameters, frozen: &[&str]) -> Result<Self, NnError> {
         spec.validate()?;
         let mut tensors = BTreeMap::new();
@@ -120,8 +120,8 @@ impl Network {
         }
     }
 
-    /// As [`Model::predict_rollouts`], `steps` frames instead of the horizon; the conditioning has as many actions. Up to the
-    /// horizon the frames are those of [`Model::predict_rollouts`] with the last action held. Beyond it, which no training saw,
+    /// As [`Network::predict_rollouts`], `steps` frames instead of the horizon; the conditioning has as many actions. Up to the
+    /// horizon the frames are those of [`Network::predict_rollouts`] with the last action held. Beyond it, which no training saw,
     /// the dense network goes on step by step; the flow network starts again from the frames that it predicted.
     /// Errors: `Shape`, `Missing`, `Tensor` if there is no such window.
     pub fn predict_steps(

@@ -13,7 +13,7 @@ const BLOCK_WINDOWS: usize = 5;
 /// Share of the resampled values that an [`Interval`] holds.
 pub(super) const CONFIDENCE: f64 = 0.95;
 
-/// The range of the middle [`CONFIDENCE`] of the values computed from resampled trials.
+/// The range of the middle 95 % of the values computed from resampled trials.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Interval {
     /// Lower end.
