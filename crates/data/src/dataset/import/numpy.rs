@@ -1,8 +1,7 @@
 //! `NumPy` arrays of frames (`.npy`): T×H×W, or many sequences as T×N×H×W or N×T×H×W (the shorter of the two first sides
 //! is time, as in Moving MNIST's test file), as bytes or as floating-point numbers 0…1, in gray, or as bytes in RGB.
 //!
-//! The header is parsed here, not by the crate `npyz`: it allocates whatever length a header states (up to 4 GiB), and its parser
-//! calls itself for each bracket of the header.
+//! The header is parsed here, not by the crate `npyz`: it allocates whatever length a header states, up to 4 GiB.
 
 use std::io::{BufReader, Read};
 use std::path::Path;
