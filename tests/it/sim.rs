@@ -261,7 +261,7 @@ fn the_camera_projects_points_as_a_pinhole() {
         y_m: 0.5,
         heading_rad: std::f32::consts::FRAC_PI_2,
     };
-    let camera = Camera::new(&config, pose);
+    let camera = Camera::new(&config, &config.camera, pose);
     // Two metres ahead (along y), at the camera's height: the image's middle.
     let height = config.camera.height_m as f32;
     let [column, row] = camera.project([1.0, 2.5, height]).unwrap();

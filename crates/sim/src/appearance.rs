@@ -75,6 +75,9 @@ static TALL: RobotAppearance = RobotAppearance {
     ],
 };
 
+/// Number of different appearances of other robots.
+pub(super) const KINDS: usize = 4;
+
 /// Appearance of the robots besides Tb1: index 0 is Tb2, a TurtleBot; the others look different.
 pub(super) fn of_other_robot(index: usize) -> &'static RobotAppearance {
     match index {

@@ -70,34 +70,15 @@ pub fn bearing(pose: PlanarPose, to: [f32; 2]) -> f32 {
     wrap((to[1] - pose.y_m).atan2(to[0] - pose.x_m) - pose.heading_rad)
 }
 
-/// How far a disc of this radius can move straight ahead until it touches a wall, a pillar or one of the `others` (discs of
-/// the same radius), in metres.
-#[must_use]
-pub fn clearance(pose: PlanarPose, radius_m: f32, others: &[[f32; 2]]) -> f32 {
-    let (sin, cos) = pose.heading_rad.sin_cos();
-    let wall = |at: f32, direction: f32, low: f32, high: f32| {
-        if direction.abs() < 1e-6 {
-            return f32::INFINITY;
-        }
-        let edge = if direction > 0.0 {
-            high - radius_m
-        } else {
-            low + radius_m
-        };
-        ((edge - at) / direction).max(0.0)
-    };
-    let walls = wall(pose.x_m, cos, 0.0, LENGTH_M).min(wall(pose.y_m, sin, -WIDTH_M / 2.0, WIDTH_M / 2.0));
-    let pillars = PILLARS.iter().map(|pillar| (pillar.position_m, pillar.radius_m));
-    let robots = others.iter().map(|&other| (other, radius_m));
-    pillars.chain(robots).fold(walls, |nearest, (center, radius)| {
-        let (x, y) = (center[0] - pose.x_m, center[1] - pose.y_m);
-        let (ahead, aside) = (x * cos + y * sin, y * cos - x * sin);
-        let reach = radius + radius_m;
-        if ahead <= 0.0 || aside.abs() >= reach {
-            return nearest;
-        }
-        nearest.min((ahead - (reach * reach - aside * aside).sqrt()).max(0.0))
-    })
+/// How far the middle of a disc can move straight ahead, in the direction (sin, cos), until its distance from `center` is
+/// `reach`, in metres.
+pub(super) fn clearance_of_disc(pose: PlanarPose, (sin, cos): (f32, f32), center: [f32; 2], reach: f32) -> f32 {
+    let (x, y) = (center[0] - pose.x_m, center[1] - pose.y_m);
+    let (ahead, aside) = (x * cos + y * sin, y * cos - x * sin);
+    if ahead <= 0.0 || aside.abs() >= reach {
+        return f32::INFINITY;
+    }
+    (ahead - (reach * reach - aside * aside).sqrt()).max(0.0)
 }
 
 /// Gray value of the floor at a point, 0…1: tiles of one metre with smooth joints, plus longer waves.

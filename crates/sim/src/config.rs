@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::arena;
 use super::error::SimError;
+use super::rooms::RoomSet;
 use foreframe_core::frame::MAX_SIDE_PX;
 use foreframe_core::frame::warp::CameraModel;
 
@@ -30,6 +31,13 @@ pub struct CameraConfig {
 }
 
 impl CameraConfig {
+    /// Errors: `Setting` at the first field that is out of range. The height also depends on the room.
+    pub(super) fn validate(&self) -> Result<(), SimError> {
+        in_range("camera.tilt_down_rad", self.tilt_down_rad, -1.2, 1.2)?;
+        in_range("camera.horizontal_fov_rad", self.horizontal_fov_rad, 0.1, 2.8)?;
+        in_range("camera.noise_std", self.noise_std, 0.0, 1.0)
+    }
+
     /// How it projects.
     #[must_use]
     pub fn model(&self) -> CameraModel {
@@ -121,6 +129,12 @@ pub struct WorldConfig {
     /// What the room looks like.
     #[serde(skip_serializing_if = "Look::is_gray")]
     pub look: Look,
+    /// Where each trial has a room, a camera and robots of its own: which. Absent: all trials are in the same room.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub rooms: Option<RoomSet>,
+    /// With `rooms`: the state holds the true pose instead of an odometry that starts at 0 and drifts.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub true_pose: bool,
 }
 
 impl Default for WorldConfig {
@@ -132,6 +146,8 @@ impl Default for WorldConfig {
             camera: CameraConfig::default(),
             max_duration_s: 8.0,
             look: Look::Gray,
+            rooms: None,
+            true_pose: false,
         }
     }
 }
@@ -150,9 +166,7 @@ impl WorldConfig {
         let ceiling = f64::from(arena::HEIGHT_M) - 0.1;
         in_range("frame_period_s", self.frame_period_s, 0.01, 2.0)?;
         in_range("camera.height_m", camera.height_m, 0.45, ceiling)?;
-        in_range("camera.tilt_down_rad", camera.tilt_down_rad, -1.2, 1.2)?;
-        in_range("camera.horizontal_fov_rad", camera.horizontal_fov_rad, 0.1, 2.8)?;
-        in_range("camera.noise_std", camera.noise_std, 0.0, 1.0)?;
+        camera.validate()?;
         in_range("max_duration_s", self.max_duration_s, 2.0 * self.frame_period_s, 3600.0)
     }
 

@@ -8,6 +8,7 @@ use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 
 use super::robot::PlanarPose;
+use super::room::Room;
 use super::{appearance, arena};
 
 /// Highest speed of the driver, in m/s.
@@ -47,13 +48,13 @@ impl Driver {
     }
 
     /// The next command, [m/s, rad/s], for `period` seconds. `others` are the positions of the other robots, Tb2 first.
-    pub(super) fn plan(&mut self, pose: PlanarPose, others: &[[f32; 2]], period: f32) -> [f32; 2] {
+    pub(super) fn plan(&mut self, room: &Room, pose: PlanarPose, others: &[[f32; 2]], period: f32) -> [f32; 2] {
         self.update_random_commands(period);
-        let target = self.target(pose, others, period);
+        let target = self.target(room, pose, others, period);
         let bearing = arena::bearing(pose, target);
         let linear = (CRUISE_M_S / 2.0 + self.linear) * (0.4 + 0.6 * bearing.cos().max(0.0));
         let angular = (1.2 * bearing).clamp(-0.6, 0.6) + self.angular;
-        avoid_obstacles(pose, others, [linear, angular])
+        avoid_obstacles(room, pose, others, [linear, angular])
     }
 
     fn update_random_commands(&mut self, period: f32) {
@@ -64,28 +65,28 @@ impl Driver {
     }
 
     /// The point to drive to: mostly Tb2, sometimes a random point of the room.
-    fn target(&mut self, pose: PlanarPose, others: &[[f32; 2]], period: f32) -> [f32; 2] {
+    fn target(&mut self, room: &Room, pose: PlanarPose, others: &[[f32; 2]], period: f32) -> [f32; 2] {
         let reached = self
             .target_m
             .is_some_and(|target| arena::distance(arena::position(pose), target) < 0.4);
         if reached || self.random.random::<f32>() < period / MEAN_TARGET_TIME_S {
-            let x = self.random.random_range(0.5..arena::LENGTH_M - 0.5);
+            let x = self.random.random_range(0.5..room.length_m - 0.5);
             let y = self
                 .random
-                .random_range(0.5 - arena::WIDTH_M / 2.0..arena::WIDTH_M / 2.0 - 0.5);
+                .random_range(0.5 - room.width_m / 2.0..room.width_m / 2.0 - 0.5);
             self.target_m = self.random.random_bool(0.25).then_some([x, y]);
         }
         self.target_m
             .or(others.first().copied())
-            .unwrap_or([arena::LENGTH_M / 2.0, 0.0])
+            .unwrap_or([room.length_m / 2.0, 0.0])
     }
 }
 
 /// Slows down before obstacles and turns to the side with more free space.
-fn avoid_obstacles(pose: PlanarPose, others: &[[f32; 2]], [linear, angular]: [f32; 2]) -> [f32; 2] {
+fn avoid_obstacles(room: &Room, pose: PlanarPose, others: &[[f32; 2]], [linear, angular]: [f32; 2]) -> [f32; 2] {
     let clearance = |angle: f32| {
         let heading_rad = pose.heading_rad + angle;
-        arena::clearance(
+        room.clearance(
             PlanarPose { heading_rad, ..pose },
             appearance::TURTLEBOT.radius_m,
             others,

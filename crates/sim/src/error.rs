@@ -22,6 +22,14 @@ pub enum SimError {
         /// The name given.
         name: String,
     },
+    /// No set of rooms has this name.
+    #[error("there are no rooms \"{name}\"; there are {known}")]
+    UnknownRooms {
+        /// The name given.
+        name: String,
+        /// The names of all sets.
+        known: String,
+    },
     /// A frame side is zero or too large.
     #[error("a frame of {width}×{height} px is out of range; each side must be 1 to {max} px", max = MAX_SIDE_PX)]
     FrameSize {

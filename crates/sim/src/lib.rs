@@ -19,12 +19,16 @@ pub mod pid;
 mod ray_cast;
 mod rendered_robot;
 pub mod robot;
+mod room;
+mod rooms;
 pub mod scenario;
+mod surface;
 mod world;
 
 pub use config::{CameraConfig, Look, WorldConfig};
 pub use environment::Environment;
 pub use error::SimError;
 pub use robot::PlanarPose;
-pub use scenario::{PidGains, Scenario, TrialParameters};
+pub use rooms::RoomSet;
+pub use scenario::{PidGains, Scenario, TrialParameters, TrialRoom};
 pub use world::{Observation, StepResult, World, action_channels, state_channels};

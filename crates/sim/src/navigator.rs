@@ -6,8 +6,9 @@ use rand_chacha::ChaCha8Rng;
 
 use super::pid::Pid;
 use super::robot::PlanarPose;
+use super::room::Room;
 use super::scenario::Route;
-use super::{arena, robot};
+use super::{appearance, arena, robot};
 
 /// A robot has reached its goal at this distance, in metres.
 pub(super) const ARRIVAL_M: f32 = 0.1;
@@ -45,15 +46,18 @@ impl Navigator {
         arena::distance(arena::position(pose), self.goal_m) < ARRIVAL_M
     }
 
-    /// Draws a new goal from the start and goal positions.
-    pub(super) fn choose_goal(&mut self, pose: PlanarPose) {
-        let positions: Vec<[f32; 2]> = arena::STARTS_M
-            .into_iter()
-            .chain(arena::GOALS_M)
-            .filter(|&position| {
-                position != self.goal_m && arena::distance(arena::position(pose), position) >= NEXT_GOAL_M
-            })
+    /// Draws a new goal from the start and goal positions; where the room has obstacles, one that can be reached straight
+    /// ahead, if there is one.
+    pub(super) fn choose_goal(&mut self, room: &Room, pose: PlanarPose) {
+        let here = arena::position(pose);
+        let mut positions: Vec<[f32; 2]> = (room.starts_m.into_iter().chain(room.goals_m))
+            .filter(|&position| position != self.goal_m && arena::distance(here, position) >= NEXT_GOAL_M)
             .collect();
+        if room.checks_ways {
+            let is_free = |&position: &[f32; 2]| room.is_way_free(here, position, appearance::TURTLEBOT.radius_m);
+            let free: Vec<[f32; 2]> = positions.iter().copied().filter(is_free).collect();
+            positions = if free.is_empty() { positions } else { free };
+        }
         if let Some(&goal) = positions.get(self.random.random_range(0..positions.len().max(1))) {
             self.goal_m = goal;
         }

@@ -10,8 +10,8 @@ use rapier3d::prelude::{
     ColliderBuilder, ColliderHandle, ContactPair, LockedAxes, PhysicsWorld, RigidBodyBuilder, RigidBodyHandle, Vector,
 };
 
-use super::arena;
 use super::robot::{DifferentialDrive, PlanarPose, WHEEL_BASE_M, mean_velocity};
+use super::room::{Footprint, Room};
 
 /// Height of the centers of all colliders, in metres.
 const PLANE_M: f32 = 0.2;
@@ -27,19 +27,19 @@ struct Body {
     drive: DifferentialDrive,
 }
 
-/// The arena with its robots, in the order in which they were added.
+/// A room with its robots, in the order in which they were added.
 pub(super) struct PhysicsScene {
     physics: PhysicsWorld,
     robots: Vec<Body>,
 }
 
 impl PhysicsScene {
-    /// The empty arena: walls and pillars.
-    pub(super) fn new() -> Self {
+    /// The room without robots: its walls and pieces.
+    pub(super) fn new(room: &Room) -> Self {
         let mut physics = PhysicsWorld::new();
         physics.gravity = Vector::ZERO;
         let half = WALL_THICKNESS_M / 2.0;
-        let (length, width) = (arena::LENGTH_M, arena::WIDTH_M);
+        let (length, width) = (room.length_m, room.width_m);
         for (x, y, half_x, half_y) in [
             (-half, 0.0, half, width),
             (length + half, 0.0, half, width),
@@ -49,10 +49,14 @@ impl PhysicsScene {
             let wall = ColliderBuilder::cuboid(half_x, half_y, 1.0).translation(Vector::new(x, y, PLANE_M));
             physics.insert_collider(wall, None);
         }
-        for pillar in arena::PILLARS {
-            let [x, y] = pillar.position_m;
-            let disc = ColliderBuilder::ball(pillar.radius_m).translation(Vector::new(x, y, PLANE_M));
-            physics.insert_collider(disc, None);
+        for piece in &room.pieces {
+            let ([x, y], collider) = match piece.footprint {
+                Footprint::Disc { center_m, radius_m } => (center_m, ColliderBuilder::ball(radius_m)),
+                Footprint::Rectangle { center_m, half_m } => {
+                    (center_m, ColliderBuilder::cuboid(half_m[0], half_m[1], 1.0))
+                }
+            };
+            physics.insert_collider(collider.translation(Vector::new(x, y, PLANE_M)), None);
         }
         Self {
             physics,
@@ -78,8 +82,13 @@ impl PhysicsScene {
         });
     }
 
-    /// Sets the robot's velocity command, [m/s, rad/s], clamped to the limits of the base. A robot's number is its place in
+    /// Lets the robot's odometry start at 0 and drift: see [`DifferentialDrive::set_drift`]. A robot's number is its place in
     /// the order in which the robots were added, here and below.
+    pub(super) fn set_drift(&mut self, robot: usize, radius_factors: [f32; 2]) {
+        self.robots[robot].drive.set_drift(radius_factors);
+    }
+
+    /// Sets the robot's velocity command, [m/s, rad/s], clamped to the limits of the base.
     pub(super) fn command(&mut self, robot: usize, [linear, angular]: [f32; 2]) {
         self.robots[robot].drive.command(linear, angular);
     }
@@ -118,9 +127,12 @@ impl PhysicsScene {
     /// The robot's wheel odometry, with the components of [`super::state_channels`].
     pub(super) fn odometry(&self, robot: usize) -> Vec<f32> {
         let drive = &self.robots[robot].drive;
-        let (pose, (linear, angular)) = (drive.odometry(), drive.velocity());
-        let (sin, cos) = pose.heading_rad.sin_cos();
-        vec![pose.x_m, pose.y_m, cos, sin, linear, angular]
+        state_of(drive.odometry(), drive.measured_velocity())
+    }
+
+    /// The state with the true pose instead of the odometry's.
+    pub(super) fn true_state(&self, robot: usize) -> Vec<f32> {
+        state_of(self.pose(robot), self.robots[robot].drive.measured_velocity())
     }
 
     /// Whether the robot touches a wall, a pillar or another robot.
@@ -128,6 +140,11 @@ impl PhysicsScene {
         let mut contacts = self.physics.contact_pairs_with(self.robots[robot].collider);
         contacts.any(ContactPair::has_any_active_contact)
     }
+}
+
+fn state_of(pose: PlanarPose, (linear, angular): (f32, f32)) -> Vec<f32> {
+    let (sin, cos) = pose.heading_rad.sin_cos();
+    vec![pose.x_m, pose.y_m, cos, sin, linear, angular]
 }
 
 fn heading(rotation: &rapier3d::prelude::Rotation) -> f32 {

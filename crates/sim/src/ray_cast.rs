@@ -72,6 +72,7 @@ impl UprightCylinder {
 }
 
 /// A solid shape.
+#[derive(Clone, Copy, Debug)]
 pub(super) enum Solid {
     Cylinder(UprightCylinder),
     /// A box with its sides parallel to the axes.

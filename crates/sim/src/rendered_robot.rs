@@ -20,6 +20,8 @@ pub(super) struct NearestHit {
 /// A robot as the camera sees it.
 pub(super) struct RenderedRobot {
     appearance: &'static RobotAppearance,
+    /// Added to the gray value of every part.
+    tint: f32,
     position: Vector,
     cos: f32,
     sin: f32,
@@ -27,10 +29,11 @@ pub(super) struct RenderedRobot {
 }
 
 impl RenderedRobot {
-    pub(super) fn new(appearance: &'static RobotAppearance, pose: PlanarPose, id: u8) -> Self {
+    pub(super) fn new(appearance: &'static RobotAppearance, tint: f32, pose: PlanarPose, id: u8) -> Self {
         let (sin, cos) = pose.heading_rad.sin_cos();
         Self {
             appearance,
+            tint,
             position: Vector::new(pose.x_m, pose.y_m, 0.0),
             cos,
             sin,
@@ -89,7 +92,7 @@ impl<'a> RobotView<'a> {
                 *hit = NearestHit {
                     time: found.time_of_impact,
                     normal: rotated(found.normal, self.robot.sin, self.robot.cos),
-                    albedo: part.albedo,
+                    albedo: (part.albedo + self.robot.tint).clamp(0.02, 0.98),
                     surface: 256 * u16::from(self.robot.id) + 8 * index + face(&found) as u16,
                     robot_id: self.robot.id,
                 };

@@ -34,6 +34,8 @@ pub struct DifferentialDrive {
     target_rad_s: [f32; 2],
     wheel_rad_s: [f32; 2],
     odometry: PlanarPose,
+    /// True radius of each wheel over [`WHEEL_RADIUS_M`], which the odometry assumes.
+    radius_factors: [f32; 2],
 }
 
 impl DifferentialDrive {
@@ -44,7 +46,18 @@ impl DifferentialDrive {
             target_rad_s: [0.0; 2],
             wheel_rad_s: [0.0; 2],
             odometry: pose,
+            radius_factors: [1.0; 2],
         }
+    }
+
+    /// Lets the odometry start at 0 and drift: the wheels have these radii, relative to the radius that it assumes.
+    pub fn set_drift(&mut self, radius_factors: [f32; 2]) {
+        self.odometry = PlanarPose {
+            x_m: 0.0,
+            y_m: 0.0,
+            heading_rad: 0.0,
+        };
+        self.radius_factors = radius_factors;
     }
 
     /// Sets the target wheel speeds for this body velocity; each component is clamped to the limits of the base.
@@ -61,15 +74,25 @@ impl DifferentialDrive {
         for (speed, target) in self.wheel_rad_s.iter_mut().zip(self.target_rad_s) {
             *speed += (target - *speed).clamp(-max_change, max_change);
         }
-        let (linear, angular) = self.velocity();
+        let (linear, angular) = self.measured_velocity();
         self.odometry = roll(self.odometry, linear, angular, dt);
     }
 
     /// Velocity of a body that rolls without slipping, in m/s and rad/s.
     #[must_use]
     pub fn velocity(&self) -> (f32, f32) {
+        let ([left, right], [left_factor, right_factor]) = (self.wheel_rad_s, self.radius_factors);
+        body_velocity(
+            left * WHEEL_RADIUS_M * left_factor,
+            right * WHEEL_RADIUS_M * right_factor,
+        )
+    }
+
+    /// The velocity that the odometry computes from the wheels' speeds, in m/s and rad/s.
+    #[must_use]
+    pub fn measured_velocity(&self) -> (f32, f32) {
         let [left, right] = self.wheel_rad_s.map(|speed| speed * WHEEL_RADIUS_M);
-        (f32::midpoint(left, right), (right - left) / WHEEL_BASE_M)
+        body_velocity(left, right)
     }
 
     /// The pose estimated from the wheels.
@@ -77,6 +100,11 @@ impl DifferentialDrive {
     pub fn odometry(&self) -> PlanarPose {
         self.odometry
     }
+}
+
+/// Velocity of the body from the speeds of the wheels' rims, in m/s.
+fn body_velocity(left: f32, right: f32) -> (f32, f32) {
+    (f32::midpoint(left, right), (right - left) / WHEEL_BASE_M)
 }
 
 /// The pose after rolling for `dt` seconds at constant wheel speeds: the exact arc of a unicycle. The formula uses the arc's

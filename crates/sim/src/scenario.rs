@@ -9,10 +9,12 @@ use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
-use super::config::in_range;
+use super::config::{CameraConfig, WorldConfig, in_range};
 use super::error::SimError;
 use super::pid::Gains;
 use super::robot::PlanarPose;
+use super::room::Room;
+use super::rooms::{RoomSet, free_place};
 use super::{arena, robot};
 use foreframe_core::types::Seed;
 
@@ -123,6 +125,17 @@ pub struct Route {
     pub gains: PidGains,
 }
 
+/// The room and the camera of a trial that has its own.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
+#[serde(deny_unknown_fields)]
+pub struct TrialRoom {
+    /// The set of the room. The room itself is drawn again from the trial's seed and number.
+    pub set: RoomSet,
+    /// Tb1's camera.
+    pub camera: CameraConfig,
+}
+
 /// All random parameters of a trial.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
@@ -147,36 +160,54 @@ pub struct TrialParameters {
     pub observer: PlanarPose,
     /// The robots besides Tb1 and Tb2 (`crowded`).
     pub crowd: Vec<Route>,
+    /// Its own room and camera; none where all trials are in the same room.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub room: Option<TrialRoom>,
 }
 
 impl TrialParameters {
-    /// Draws the parameters of trial number `trial` of the seed. Other trials need not be drawn first.
+    /// Draws the parameters of trial number `trial` of the seed, in the room of all trials. Other trials need not be drawn
+    /// first.
     #[must_use]
     pub fn draw(scenario: Scenario, seed: Seed, trial: u64) -> Self {
+        Self::draw_in(&WorldConfig::default(), scenario, seed, trial)
+    }
+
+    /// As [`Self::draw`], in a room of its own if the configuration has `rooms`.
+    #[must_use]
+    pub fn draw_in(config: &WorldConfig, scenario: Scenario, seed: Seed, trial: u64) -> Self {
+        let own_room = config.rooms.map(|set| {
+            let mut random = seed.derive("trial", trial).derive("camera", 0).rng();
+            TrialRoom {
+                set,
+                camera: set.draw_camera(&mut random, config.camera.noise_std),
+            }
+        });
+        let room = room(own_room.as_ref(), seed, trial);
         let mut random = seed.derive("trial", trial).rng();
         let start = random.random_range(0..arena::STARTS_M.len());
         let goal = random.random_range(0..arena::GOALS_M.len());
         let gains = PidGains::draw(&mut random);
-        let start_m = arena::STARTS_M[start];
-        let ahead = facing(start_m, arena::GOALS_M[goal]);
+        let start_m = room.starts_m[start];
+        let ahead = facing(start_m, room.goals_m[goal]);
         let start_heading_rad = robot::wrap(ahead + random.random_range(-1.5..1.5));
         let mut taken = vec![start_m];
         let observer = if scenario.observer_drives() {
-            let position = free_position(&mut random, &taken, 1.0);
+            let position = free_position(&room, &mut random, &taken, 1.0);
             taken.push(position);
             let heading = facing(position, start_m) + random.random_range(-0.6..0.6);
             pose(position, robot::wrap(heading))
         } else {
-            arena::OBSERVER
+            standing_observer(&room, &mut random)
         };
         let crowd_size = if scenario == Scenario::Crowded { CROWD } else { 0 };
         let crowd = (0..crowd_size)
             .map(|_| {
-                let position = free_position(&mut random, &taken, 0.6);
+                let position = free_position(&room, &mut random, &taken, 0.6);
                 taken.push(position);
                 Route {
                     pose: pose(position, random.random_range(-3.1..3.1)),
-                    goal_m: arena::GOALS_M[random.random_range(0..arena::GOALS_M.len())],
+                    goal_m: room.goals_m[random.random_range(0..room.goals_m.len())],
                     gains: PidGains::draw(&mut random),
                 }
             })
@@ -191,6 +222,7 @@ impl TrialParameters {
             start_heading_rad,
             observer,
             crowd,
+            room: own_room,
         }
     }
 
@@ -200,9 +232,19 @@ impl TrialParameters {
         in_range("start", self.start as f64, 0.0, arena::STARTS_M.len() as f64 - 1.0)?;
         in_range("goal", self.goal as f64, 0.0, arena::GOALS_M.len() as f64 - 1.0)?;
         in_range("crowd's size", self.crowd.len() as f64, 0.0, MAX_CROWD as f64)?;
+        let room = self.room();
+        if let Some(own) = &self.room {
+            own.camera.validate()?;
+            in_range(
+                "camera.height_m",
+                own.camera.height_m,
+                0.15,
+                f64::from(room.height_m) - 0.1,
+            )?;
+        }
         for pose in self.crowd.iter().map(|route| route.pose).chain([self.observer]) {
-            in_range("x_m", f64::from(pose.x_m), 0.0, f64::from(arena::LENGTH_M))?;
-            let side = f64::from(arena::WIDTH_M) / 2.0;
+            in_range("x_m", f64::from(pose.x_m), 0.0, f64::from(room.length_m))?;
+            let side = f64::from(room.width_m) / 2.0;
             in_range("y_m", f64::from(pose.y_m), -side, side)?;
             in_range("heading_rad", f64::from(pose.heading_rad), -7.0, 7.0)?;
         }
@@ -216,26 +258,49 @@ impl TrialParameters {
         self.has_held_out_pair() || HELD_OUT_HEADING_GAIN.contains(&self.gains.heading.proportional)
     }
 
-    /// Whether the trial's start/goal pair is one of [`HELD_OUT_PAIRS`].
+    /// Whether the trial's start/goal pair is one of [`HELD_OUT_PAIRS`]. In rooms of their own, pairs have no meaning.
     #[must_use]
     pub fn has_held_out_pair(&self) -> bool {
-        HELD_OUT_PAIRS.contains(&(self.start, self.goal))
+        self.room.is_none() && HELD_OUT_PAIRS.contains(&(self.start, self.goal))
     }
 
     /// The route of Tb2, then those of the other robots. Call it only after [`Self::validate`] has passed.
-    pub(super) fn routes(&self) -> Vec<Route> {
+    pub(super) fn routes(&self, room: &Room) -> Vec<Route> {
         let tb2 = Route {
-            pose: pose(arena::STARTS_M[self.start], self.start_heading_rad),
-            goal_m: arena::GOALS_M[self.goal],
+            pose: pose(room.starts_m[self.start], self.start_heading_rad),
+            goal_m: room.goals_m[self.goal],
             gains: self.gains,
         };
         std::iter::once(tb2).chain(self.crowd.iter().copied()).collect()
+    }
+
+    /// The room of the trial.
+    pub(super) fn room(&self) -> Room {
+        room(self.room.as_ref(), self.seed, self.trial)
     }
 
     /// A separate random generator of this trial for the named use.
     pub(super) fn stream(&self, name: &str, index: u64) -> ChaCha8Rng {
         self.seed.derive("trial", self.trial).derive(name, index).rng()
     }
+}
+
+/// The room of a trial.
+fn room(own: Option<&TrialRoom>, seed: Seed, trial: u64) -> Room {
+    own.map_or_else(Room::arena, |own| {
+        own.set
+            .draw_room(&mut seed.derive("trial", trial).derive("room", 0).rng())
+    })
+}
+
+/// Where Tb1 stands in a scenario where it does not drive: in a room of its own, near the middle of a wall's length, looking
+/// along the room.
+fn standing_observer(room: &Room, random: &mut ChaCha8Rng) -> PlanarPose {
+    if !room.checks_ways {
+        return arena::OBSERVER;
+    }
+    let position = free_place(room, random, &room.starts_m, 0.8);
+    pose(position, facing(position, room.goals_m[0]))
 }
 
 fn pose([x_m, y_m]: [f32; 2], heading_rad: f32) -> PlanarPose {
@@ -247,8 +312,11 @@ fn facing(from: [f32; 2], to: [f32; 2]) -> f32 {
     (to[1] - from[1]).atan2(to[0] - from[0])
 }
 
-/// A random position away from walls and pillars, at least `min_distance` metres from the positions `taken`.
-fn free_position(random: &mut ChaCha8Rng, taken: &[[f32; 2]], min_distance: f32) -> [f32; 2] {
+/// A random position away from walls and pieces, at least `min_distance` metres from the positions `taken`.
+fn free_position(room: &Room, random: &mut ChaCha8Rng, taken: &[[f32; 2]], min_distance: f32) -> [f32; 2] {
+    if room.checks_ways {
+        return free_place(room, random, taken, min_distance);
+    }
     loop {
         let x = random.random_range(0.4..arena::LENGTH_M - 0.4);
         let y = random.random_range(0.4 - arena::WIDTH_M / 2.0..arena::WIDTH_M / 2.0 - 0.4);

@@ -2,21 +2,25 @@
 
 use foreframe_core::frame::Frame;
 use foreframe_core::types::{Action, Channel, RobotState, Seed};
+use rand::Rng;
 
 use super::appearance::{self, RobotAppearance};
 use super::arena;
 use super::camera::Camera;
-use super::config::WorldConfig;
+use super::config::{CameraConfig, WorldConfig};
 use super::driver::Driver;
 use super::error::SimError;
 use super::navigator::Navigator;
 use super::physics::PhysicsScene;
 use super::rendered_robot::RenderedRobot;
 use super::robot::PlanarPose;
+use super::room::Room;
 use super::scenario::{Scenario, TrialParameters};
 
 /// Longest physics step, in seconds. A frame period is divided into equal steps that are not longer than this.
 const PHYSICS_STEP_S: f32 = 0.02;
+/// Greatest relative error of the radius that the odometry assumes for a wheel, in rooms of their own.
+const WHEEL_ERROR: f32 = 0.02;
 /// In a scenario that does not end at a goal, a robot that touches something for this long gets a new goal, in seconds.
 const BLOCKED_LIMIT_S: f32 = 1.0;
 
@@ -70,18 +74,21 @@ pub fn state_channels() -> Vec<Channel> {
 /// Another robot: its appearance and its controller.
 struct OtherRobot {
     appearance: &'static RobotAppearance,
+    /// Added to its gray values.
+    tint: f32,
     navigator: Navigator,
     blocked_s: f32,
 }
 
 impl OtherRobot {
     /// Gives the robot its next command, and a new goal where the scenario continues after a goal.
-    fn control(&mut self, physics: &mut PhysicsScene, robot: usize, ends_at_goal: bool, dt: f32) {
+    fn control(&mut self, scene: (&Room, &mut PhysicsScene), robot: usize, ends_at_goal: bool, dt: f32) {
+        let (room, physics) = scene;
         let pose = physics.pose(robot);
         let is_touching = physics.is_touching(robot);
         self.blocked_s = if is_touching { self.blocked_s + dt } else { 0.0 };
         if !ends_at_goal && (self.navigator.has_arrived(pose) || self.blocked_s > BLOCKED_LIMIT_S) {
-            self.navigator.choose_goal(pose);
+            self.navigator.choose_goal(room, pose);
             self.blocked_s = 0.0;
         }
         physics.command(robot, self.navigator.command(pose, dt));
@@ -92,6 +99,7 @@ impl OtherRobot {
 pub struct World {
     config: WorldConfig,
     parameters: TrialParameters,
+    room: Room,
     physics: PhysicsScene,
     others: Vec<OtherRobot>,
     driver: Driver,
@@ -104,7 +112,7 @@ pub struct World {
 impl World {
     /// Starts trial number `trial` of the seed. Errors: as [`WorldConfig::validate`].
     pub fn new(scenario: Scenario, config: &WorldConfig, seed: Seed, trial: u64) -> Result<Self, SimError> {
-        Self::from_parameters(TrialParameters::draw(scenario, seed, trial), config)
+        Self::from_parameters(TrialParameters::draw_in(config, scenario, seed, trial), config)
     }
 
     /// Starts a trial with the given parameters, to repeat a trial or to set one up by hand. Errors: as
@@ -112,15 +120,28 @@ impl World {
     pub fn from_parameters(parameters: TrialParameters, config: &WorldConfig) -> Result<Self, SimError> {
         config.validate()?;
         parameters.validate()?;
-        let mut physics = PhysicsScene::new();
+        let room = parameters.room();
+        let mut physics = PhysicsScene::new(&room);
         physics.add_robot(parameters.observer, appearance::TURTLEBOT.radius_m);
+        let mut drawn = parameters.room.is_some().then(|| parameters.stream("robots", 0));
+        if let Some(random) = &mut drawn {
+            let mut factor = || 1.0 + random.random_range(-WHEEL_ERROR..WHEEL_ERROR);
+            physics.set_drift(0, [factor(), factor()]);
+        }
         let mut others = Vec::new();
-        for (index, route) in parameters.routes().into_iter().enumerate() {
-            let appearance = appearance::of_other_robot(index);
+        for (index, route) in parameters.routes(&room).into_iter().enumerate() {
+            let (kind, tint) = drawn.as_mut().map_or((index, 0.0), |random| {
+                (
+                    random.random_range(0..appearance::KINDS),
+                    random.random_range(-0.25..0.25),
+                )
+            });
+            let appearance = appearance::of_other_robot(kind);
             physics.add_robot(route.pose, appearance.radius_m);
             let random = parameters.stream("route", index as u64);
             others.push(OtherRobot {
                 appearance,
+                tint,
                 navigator: Navigator::new(route, random),
                 blocked_s: 0.0,
             });
@@ -135,6 +156,7 @@ impl World {
             config: config.clone(),
             driver: Driver::new(parameters.stream("driver", 0)),
             parameters,
+            room,
             physics,
             others,
             frame_index: 0,
@@ -168,7 +190,14 @@ impl World {
     #[must_use]
     #[doc(hidden)]
     pub fn camera(&self) -> Camera {
-        Camera::new(&self.config, self.physics.pose(0))
+        Camera::new(&self.config, self.camera_config(), self.physics.pose(0))
+    }
+
+    fn camera_config(&self) -> &CameraConfig {
+        self.parameters
+            .room
+            .as_ref()
+            .map_or(&self.config.camera, |own| &own.camera)
     }
 
     /// True poses of the other robots, Tb2 first.
@@ -190,10 +219,10 @@ impl World {
             .iter()
             .zip(self.other_robot_poses())
             .zip(1..)
-            .map(|((robot, pose), id)| RenderedRobot::new(robot.appearance, pose, id))
+            .map(|((robot, pose), id)| RenderedRobot::new(robot.appearance, robot.tint, pose, id))
             .collect();
         let noise = self.parameters.stream("noise", self.frame_index);
-        self.camera().capture(&robots, noise)
+        self.camera().capture(&self.room, &robots, noise)
     }
 
     /// Simulates one frame period with this action. Commands beyond Tb1's limits are clamped to [`super::robot::MAX_LINEAR_M_S`] and
@@ -235,7 +264,7 @@ impl World {
         let mut touched = false;
         for _ in 0..steps as usize {
             for (other, robot) in self.others.iter_mut().zip(1..) {
-                other.control(&mut self.physics, robot, ends_at_goal, dt);
+                other.control((&self.room, &mut self.physics), robot, ends_at_goal, dt);
             }
             self.physics.advance(dt);
             touched |= self.physics.is_touching(0);
@@ -249,7 +278,7 @@ impl World {
             return 0.0;
         }
         let bearing = arena::bearing(self.physics.pose(0), arena::position(self.physics.pose(1)));
-        let half_view = self.config.camera.horizontal_fov_rad as f32 / 2.0;
+        let half_view = self.camera_config().horizontal_fov_rad as f32 / 2.0;
         (1.0 - bearing.abs() / half_view).clamp(0.0, 1.0)
     }
 
@@ -259,14 +288,21 @@ impl World {
         self.observation = Observation {
             frame,
             mask,
-            state: RobotState::try_from(self.physics.odometry(0))?,
+            state: RobotState::try_from(if self.config.true_pose {
+                self.physics.true_state(0)
+            } else {
+                self.physics.odometry(0)
+            })?,
             time_s: self.frame_index as f64 * self.config.frame_period_s,
         };
         if self.parameters.scenario.observer_drives() {
             let others: Vec<[f32; 2]> = self.other_robot_poses().into_iter().map(arena::position).collect();
-            let command = self
-                .driver
-                .plan(self.physics.pose(0), &others, self.config.frame_period_s as f32);
+            let command = self.driver.plan(
+                &self.room,
+                self.physics.pose(0),
+                &others,
+                self.config.frame_period_s as f32,
+            );
             self.policy_action = Action::try_from(command.to_vec())?;
         }
         Ok(())
