@@ -69,8 +69,8 @@ pub mod sim {
     pub use foreframe_sim::pid::Gains;
     pub use foreframe_sim::scenario::Route;
     pub use foreframe_sim::{
-        CameraConfig, Environment, Look, Observation, PidGains, PlanarPose, Scenario, SimError, StepResult,
-        TrialParameters, World, WorldConfig, action_channels, state_channels,
+        CameraConfig, Environment, Look, Observation, PidGains, PlanarPose, RoomSet, Scenario, SimError, StepResult,
+        TrialParameters, TrialRoom, World, WorldConfig, action_channels, state_channels,
     };
 }
 

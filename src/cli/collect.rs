@@ -19,7 +19,7 @@ use foreframe_data::dataset::moving_mnist::{
 };
 use foreframe_data::dataset::{Dataset, DatasetInfo, Split, Splits};
 use foreframe_jobs::jobs::spec::MAX_TRIALS;
-use foreframe_sim::{Look, Scenario, SimError, WorldConfig};
+use foreframe_sim::{Look, RoomSet, Scenario, SimError, WorldConfig};
 use foreframe_train::training::TrainConfig;
 use foreframe_train::training::config::WindowBudget;
 
@@ -69,6 +69,7 @@ impl fmt::Display for CollectSubject {
 #[command(after_help = "Examples:
   foreframe collect --trials 200
   foreframe collect --scenario moving-observer --trials 500
+  foreframe collect --scenario moving-observer --rooms varied --trials 500
   foreframe collect --trials 60 --seed 2 --out data/datasets/small
   foreframe collect --scenario moving-mnist --digits mnist/ --trials 10000")]
 pub(super) struct CollectArgs {
@@ -78,7 +79,7 @@ pub(super) struct CollectArgs {
     scenario: CollectSubject,
     /// For moving-mnist: an IDX file of digits (.gz or not), a folder with MNIST's train-images and t10k-images files, or a
     /// folder of 28×28 PNG images
-    #[arg(long, value_name = "PATH", conflicts_with_all = ["frame_size", "noise", "look", "threads"])]
+    #[arg(long, value_name = "PATH", conflicts_with_all = ["frame_size", "noise", "look", "rooms", "threads"])]
     digits: Option<PathBuf>,
     /// For moving-mnist: frames of a trial
     #[arg(long, requires = "digits", default_value_t = DEFAULT_FRAMES as u16, value_parser = value_parser!(u16).range(2..=MAX_FRAMES as i64))]
@@ -89,7 +90,7 @@ pub(super) struct CollectArgs {
     /// The seed of all random numbers: the same seed gives the same bytes
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    /// The directory of the data set [default: `DATA_DIR/datasets/SCENARIO`]
+    /// The directory of the data set [default: `DATA_DIR/datasets/SCENARIO`, with `--rooms` `SCENARIO-SET`]
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
     /// Threads that simulate [default: one for each core]
@@ -104,6 +105,15 @@ pub(super) struct CollectArgs {
     /// What the room looks like: gray, or bright (white walls and floor, so that only robots stand out)
     #[arg(long, default_value_t = Look::Gray)]
     look: Look,
+    /// Draws a room, a camera and robots for each trial: varied (to train on; the trials of its test split are rooms never
+    /// seen), new-materials or new-cameras (only for tests: surfaces and furniture, or cameras, that varied never has)
+    /// [default: all trials are in the same room]
+    #[arg(long, value_name = "SET")]
+    rooms: Option<RoomSet>,
+    /// With --rooms: states hold the true pose. Otherwise they hold what a robot's odometry measures: it starts at 0 and
+    /// drifts
+    #[arg(long, requires = "rooms")]
+    true_pose: bool,
     #[command(flatten)]
     settings: CommonArgs,
 }
@@ -112,7 +122,7 @@ pub(super) fn run(args: &CollectArgs) -> Result<(), CliError> {
     let workspace = Workspace::new(args.settings.start()?);
     let out = match &args.out {
         Some(out) => out.clone(),
-        None => workspace.datasets_dir().join(args.scenario.to_string()),
+        None => workspace.datasets_dir().join(default_name(args)),
     };
     let (cancelled, progress) = (interrupt::flag()?, ProgressLine::new("trials"));
     progress.label(&format!("collecting {}", args.scenario));
@@ -159,6 +169,14 @@ pub(super) fn run(args: &CollectArgs) -> Result<(), CliError> {
     print_line(format!("next: {}", next_step(args, &out, &info)?))
 }
 
+/// The name of the data set's directory, unless it is given.
+fn default_name(args: &CollectArgs) -> String {
+    match args.rooms {
+        Some(rooms) => format!("{}-{rooms}", args.scenario),
+        None => args.scenario.to_string(),
+    }
+}
+
 /// The collection of a simulated scenario.
 fn simulation(args: &CollectArgs, scenario: Scenario, out: &Path) -> CollectConfig {
     let mut config = CollectConfig::new(scenario, args.trials, Seed(args.seed), out);
@@ -166,6 +184,8 @@ fn simulation(args: &CollectArgs, scenario: Scenario, out: &Path) -> CollectConf
     config.world.frame_height_px = args.frame_size;
     config.world.camera.noise_std = args.noise;
     config.world.look = args.look;
+    config.world.rooms = args.rooms;
+    config.world.true_pose = args.true_pose;
     config.threads = args.threads.unwrap_or_default().into();
     config
 }

@@ -68,6 +68,7 @@ mod readme;
 mod recordings;
 mod resize;
 mod rollouts;
+mod rooms;
 mod server;
 mod service;
 mod session_frames;

@@ -107,5 +107,8 @@ fn the_driver_rarely_collides_with_furniture() {
 #[test]
 fn an_unknown_set_of_rooms_is_refused_with_the_known_ones() {
     let error = "old".parse::<RoomSet>().unwrap_err().to_string();
-    assert_eq!(error, "there are no rooms \"old\"; there are varied, new-materials, new-cameras");
+    assert_eq!(
+        error,
+        "there are no rooms \"old\"; there are varied, new-materials, new-cameras"
+    );
 }

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::arena;
 use super::error::SimError;
-use super::rooms::RoomSet;
+use super::room_set::RoomSet;
 use foreframe_core::frame::MAX_SIDE_PX;
 use foreframe_core::frame::warp::CameraModel;
 

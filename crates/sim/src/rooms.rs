@@ -10,12 +10,12 @@ mod walls;
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 use rapier3d::prelude::Vector;
-use serde::{Deserialize, Serialize};
 
 use self::furniture::Kind;
 use super::arena;
 use super::config::CameraConfig;
 use super::room::{Light, Piece, Room};
+use super::room_set::RoomSet;
 use super::surface::Pattern;
 
 /// Free space that robots need around a start or a goal, in metres.
@@ -23,33 +23,7 @@ pub(super) const STOP_MARGIN_M: f32 = 0.35;
 /// How often a place is drawn before the margin is made smaller.
 const TRIES: usize = 60;
 
-/// Which rooms trials are in, where each trial has a room of its own.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
-#[serde(rename_all = "kebab-case")]
-pub enum RoomSet {
-    /// Rooms to train on. Other trials of the set are new rooms of the same kinds.
-    Varied,
-    /// Only for tests: the main surfaces have patterns, and the room has a kind of furniture, that `varied` never has.
-    NewMaterials,
-    /// Only for tests: cameras whose height, tilt and field of view are outside the ranges of `varied`.
-    NewCameras,
-}
-
 impl RoomSet {
-    /// All sets.
-    pub const ALL: [Self; 3] = [Self::Varied, Self::NewMaterials, Self::NewCameras];
-
-    /// The set's name, on the command line and on disk.
-    #[must_use]
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Varied => "varied",
-            Self::NewMaterials => "new-materials",
-            Self::NewCameras => "new-cameras",
-        }
-    }
-
     fn patterns(self) -> &'static [Pattern] {
         match self {
             Self::NewMaterials => &Pattern::HELD_OUT,
@@ -105,24 +79,6 @@ impl RoomSet {
         room.starts_m.copy_from_slice(starts);
         room.goals_m.copy_from_slice(goals);
         room
-    }
-}
-
-impl std::fmt::Display for RoomSet {
-    fn fmt(&self, out: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        out.write_str(self.name())
-    }
-}
-
-impl std::str::FromStr for RoomSet {
-    type Err = super::error::SimError;
-
-    fn from_str(name: &str) -> Result<Self, Self::Err> {
-        let found = Self::ALL.into_iter().find(|set| set.name() == name);
-        found.ok_or_else(|| super::error::SimError::UnknownRooms {
-            name: name.to_owned(),
-            known: Self::ALL.map(Self::name).join(", "),
-        })
     }
 }
 

@@ -14,7 +14,8 @@ use super::error::SimError;
 use super::pid::Gains;
 use super::robot::PlanarPose;
 use super::room::Room;
-use super::rooms::{RoomSet, free_place};
+use super::room_set::RoomSet;
+use super::rooms::free_place;
 use super::{arena, robot};
 use foreframe_core::types::Seed;
 

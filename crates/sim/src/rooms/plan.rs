@@ -4,10 +4,11 @@ use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 use rapier3d::prelude::Vector;
 
-use super::{RoomSet, bounded, walls};
+use super::{bounded, walls};
 use crate::arena;
 use crate::ray_cast::Solid;
 use crate::room::{Footprint, Light, Part, Piece, Room};
+use crate::room_set::RoomSet;
 use crate::surface::{Pattern, Surface};
 
 /// Width of a doorway, in metres.

@@ -75,8 +75,9 @@ impl CollectConfig {
 
     /// The description of the data set, without counts and hash.
     pub(super) fn info(&self) -> DatasetInfo {
+        let rooms = self.world.rooms.map(|set| format!("-{set}")).unwrap_or_default();
         DatasetInfo {
-            name: format!("{}-{}-seed-{}", self.scenario, self.trials, self.seed.0),
+            name: format!("{}{rooms}-{}-seed-{}", self.scenario, self.trials, self.seed.0),
             frame_width_px: self.world.frame_width_px,
             frame_height_px: self.world.frame_height_px,
             frame_period_s: self.world.frame_period_s,
@@ -85,7 +86,8 @@ impl CollectConfig {
             scenario: Some(self.scenario.to_string()),
             seed: Some(self.seed),
             has_masks: true,
-            camera: Some(self.world.camera.model()),
+            // With rooms, each trial has its own camera: its parameters hold it.
+            camera: self.world.rooms.is_none().then(|| self.world.camera.model()),
             world: Some(self.world.clone()),
             ..DatasetInfo::default()
         }

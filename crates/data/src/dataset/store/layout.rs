@@ -137,7 +137,8 @@ impl DatasetMetadata {
     pub(crate) fn info_in(&self, directory: &Path) -> Result<DatasetInfo, DatasetError> {
         let mut info = self.info();
         info.world = collected_world(directory)?;
-        let camera = info.world.as_ref().map(|world| &world.camera);
+        let same_camera = info.world.as_ref().filter(|world| world.rooms.is_none());
+        let camera = same_camera.map(|world| &world.camera);
         info.camera = info.camera.or(camera.map(CameraConfig::model));
         Ok(info)
     }
