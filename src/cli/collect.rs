@@ -110,8 +110,8 @@ pub(super) struct CollectArgs {
     /// [default: all trials are in the same room]
     #[arg(long, value_name = "SET")]
     rooms: Option<RoomSet>,
-    /// With --rooms: states hold the true pose. Otherwise they hold what a robot's odometry measures: it starts at 0 and
-    /// drifts
+    /// Stores the true pose in the states. Without it, they hold what a robot's odometry measures in these rooms: it starts
+    /// at 0 and drifts
     #[arg(long, requires = "rooms")]
     true_pose: bool,
     #[command(flatten)]
@@ -192,6 +192,12 @@ fn simulation(args: &CollectArgs, scenario: Scenario, out: &Path) -> CollectConf
 
 /// A training command that works on the data set, or what to do if it is too small to train on.
 fn next_step(args: &CollectArgs, out: &Path, info: &DatasetInfo) -> Result<String, CliError> {
+    if let Some(RoomSet::NewMaterials | RoomSet::NewCameras) = args.rooms {
+        let out = out.display();
+        return Ok(format!(
+            "foreframe evaluate --model MODEL --dataset {out} (these rooms are only for tests)"
+        ));
+    }
     let presets: &[&str] = match args.scenario {
         CollectSubject::Simulated(Scenario::StaticObserver) => &["paper", "static"],
         CollectSubject::Simulated(Scenario::MovingObserver) => &["moving"],

@@ -3,7 +3,7 @@
 use foreframe_core::types::Seed;
 use foreframe_sim::{Observation, RoomSet, Scenario, World, WorldConfig};
 
-use crate::sim::small;
+use crate::sim::{small, whole_trial};
 
 fn config(rooms: RoomSet) -> WorldConfig {
     WorldConfig {
@@ -15,15 +15,7 @@ fn config(rooms: RoomSet) -> WorldConfig {
 
 /// The observations of a trial that the built-in policy drives.
 fn trial(config: &WorldConfig, scenario: Scenario, trial: u64) -> (Vec<Observation>, World) {
-    let mut world = World::new(scenario, config, Seed(7), trial).unwrap();
-    let mut seen = vec![world.observe()];
-    loop {
-        let step = world.step(&world.policy_action()).unwrap();
-        seen.push(step.observation);
-        if step.terminated || step.truncated {
-            return (seen, world);
-        }
-    }
+    whole_trial(scenario, Seed(7), trial, config)
 }
 
 #[test]

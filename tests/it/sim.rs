@@ -27,7 +27,12 @@ fn world_from(x_m: f32, y_m: f32, heading_rad: f32, config: &WorldConfig) -> Wor
     World::from_parameters(parameters, config).unwrap()
 }
 
-fn whole_trial(scenario: Scenario, seed: Seed, trial: u64, config: &WorldConfig) -> (Vec<Observation>, World) {
+pub(crate) fn whole_trial(
+    scenario: Scenario,
+    seed: Seed,
+    trial: u64,
+    config: &WorldConfig,
+) -> (Vec<Observation>, World) {
     let mut world = World::new(scenario, config, seed, trial).unwrap();
     let mut seen = vec![world.observe()];
     loop {

@@ -17,7 +17,7 @@ use foreframe_core::frame::warp::CameraModel;
 #[serde(default, deny_unknown_fields)]
 pub struct CameraConfig {
     /// Height of the pinhole above the floor, in metres.
-    #[cfg_attr(feature = "schema", schema(minimum = 0.45, maximum = 2.3))]
+    #[cfg_attr(feature = "schema", schema(minimum = 0.15, maximum = 2.3))]
     pub height_m: f64,
     /// How far the camera looks down from the horizontal, in radians.
     #[cfg_attr(feature = "schema", schema(minimum = -1.2, maximum = 1.2))]
@@ -31,8 +31,9 @@ pub struct CameraConfig {
 }
 
 impl CameraConfig {
-    /// Errors: `Setting` at the first field that is out of range. The height also depends on the room.
-    pub(super) fn validate(&self) -> Result<(), SimError> {
+    /// Checks a camera in a room of this height. Errors: `Setting` at the first field that is out of range.
+    pub(super) fn validate(&self, room_height_m: f32) -> Result<(), SimError> {
+        in_range("camera.height_m", self.height_m, 0.15, f64::from(room_height_m) - 0.1)?;
         in_range("camera.tilt_down_rad", self.tilt_down_rad, -1.2, 1.2)?;
         in_range("camera.horizontal_fov_rad", self.horizontal_fov_rad, 0.1, 2.8)?;
         in_range("camera.noise_std", self.noise_std, 0.0, 1.0)
@@ -121,7 +122,7 @@ pub struct WorldConfig {
     /// Seconds from one frame to the next.
     #[cfg_attr(feature = "schema", schema(minimum = 0.01, maximum = 2))]
     pub frame_period_s: f64,
-    /// Tb1's camera.
+    /// Tb1's camera. With `rooms`, each trial draws its own, and only `noise_std` counts.
     pub camera: CameraConfig,
     /// Time limit of a trial, in seconds. A trial has the frames before this time; the first frame is at 0 s.
     #[cfg_attr(feature = "schema", schema(minimum = 0.02, maximum = 3600))]
@@ -129,10 +130,10 @@ pub struct WorldConfig {
     /// What the room looks like.
     #[serde(skip_serializing_if = "Look::is_gray")]
     pub look: Look,
-    /// Where each trial has a room, a camera and robots of its own: which. Absent: all trials are in the same room.
+    /// The set from which each trial draws a room, a camera and robots of its own. Absent: all trials are in the same room.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub rooms: Option<RoomSet>,
-    /// With `rooms`: the state holds the true pose instead of an odometry that starts at 0 and drifts.
+    /// Whether the state holds the true pose instead of the odometry's.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub true_pose: bool,
 }
@@ -162,11 +163,8 @@ impl WorldConfig {
                 height: self.frame_height_px,
             });
         }
-        let camera = &self.camera;
-        let ceiling = f64::from(arena::HEIGHT_M) - 0.1;
         in_range("frame_period_s", self.frame_period_s, 0.01, 2.0)?;
-        in_range("camera.height_m", camera.height_m, 0.45, ceiling)?;
-        camera.validate()?;
+        self.camera.validate(arena::HEIGHT_M)?;
         in_range("max_duration_s", self.max_duration_s, 2.0 * self.frame_period_s, 3600.0)
     }
 

@@ -14,12 +14,12 @@ use rapier3d::prelude::Vector;
 use self::furniture::Kind;
 use super::arena;
 use super::config::CameraConfig;
-use super::room::{Light, Piece, Room};
+use super::room::{Footprint, Light, Part, Piece, Room};
 use super::room_set::RoomSet;
 use super::surface::Pattern;
 
 /// Free space that robots need around a start or a goal, in metres.
-pub(super) const STOP_MARGIN_M: f32 = 0.35;
+const STOP_MARGIN_M: f32 = 0.35;
 /// How often a place is drawn before the margin is made smaller.
 const TRIES: usize = 60;
 
@@ -94,8 +94,8 @@ fn draw_light(random: &mut ChaCha8Rng) -> Light {
     }
 }
 
-/// A random place that is clear of walls and pieces, at least `apart_m` from the places `taken`. If the room is too narrow for
-/// that, the nearest to it: both distances shrink until a place is found.
+/// A random place that is clear of walls and pieces, at least `apart_m` from the places `taken`. If there is none, both distances
+/// shrink until a place is found.
 pub(super) fn free_place(room: &Room, random: &mut ChaCha8Rng, taken: &[[f32; 2]], apart_m: f32) -> [f32; 2] {
     let (mut margin, mut apart) = (STOP_MARGIN_M, apart_m);
     loop {
@@ -113,8 +113,8 @@ pub(super) fn free_place(room: &Room, random: &mut ChaCha8Rng, taken: &[[f32; 2]
     }
 }
 
-/// The sphere around boxes and cylinders that stand on the rectangle with this center and these half sides.
-fn bounded(parts: Vec<super::room::Part>, footprint: super::room::Footprint, top_m: f32) -> Piece {
+/// A piece whose parts stand on its footprint, with a sphere around them.
+fn bounded(parts: Vec<Part>, footprint: Footprint, top_m: f32) -> Piece {
     let [[x, y], [half_x, half_y]] = footprint.bounds();
     let half = top_m / 2.0;
     Piece {

@@ -235,13 +235,7 @@ impl TrialParameters {
         in_range("crowd's size", self.crowd.len() as f64, 0.0, MAX_CROWD as f64)?;
         let room = self.room();
         if let Some(own) = &self.room {
-            own.camera.validate()?;
-            in_range(
-                "camera.height_m",
-                own.camera.height_m,
-                0.15,
-                f64::from(room.height_m) - 0.1,
-            )?;
+            own.camera.validate(room.height_m)?;
         }
         for pose in self.crowd.iter().map(|route| route.pose).chain([self.observer]) {
             in_range("x_m", f64::from(pose.x_m), 0.0, f64::from(room.length_m))?;
@@ -289,13 +283,13 @@ impl TrialParameters {
 /// The room of a trial.
 fn room(own: Option<&TrialRoom>, seed: Seed, trial: u64) -> Room {
     own.map_or_else(Room::arena, |own| {
-        own.set
-            .draw_room(&mut seed.derive("trial", trial).derive("room", 0).rng())
+        let mut random = seed.derive("trial", trial).derive("room", 0).rng();
+        own.set.draw_room(&mut random)
     })
 }
 
-/// Where Tb1 stands in a scenario where it does not drive: in a room of its own, near the middle of a wall's length, looking
-/// along the room.
+/// Where Tb1 stands in a scenario where it does not drive. In a room of its own, that is a free place, and it looks in the direction of
+/// a goal.
 fn standing_observer(room: &Room, random: &mut ChaCha8Rng) -> PlanarPose {
     if !room.checks_ways {
         return arena::OBSERVER;

@@ -58,7 +58,8 @@ pub fn action_channels() -> Vec<Channel> {
 }
 
 /// Components of a state: the pose from Tb1's wheel odometry and the velocity from its wheel speeds. The odometry starts at
-/// the true pose and drifts when wheels slip.
+/// the true pose and drifts when wheels slip. In a room of its own it starts at 0, and drifts also because the radii of its wheels
+/// are not exactly known.
 #[must_use]
 pub fn state_channels() -> Vec<Channel> {
     vec![
@@ -81,13 +82,15 @@ struct OtherRobot {
 }
 
 impl OtherRobot {
-    /// Gives the robot its next command, and a new goal where the scenario continues after a goal.
-    fn control(&mut self, scene: (&Room, &mut PhysicsScene), robot: usize, ends_at_goal: bool, dt: f32) {
-        let (room, physics) = scene;
+    /// Gives the robot its next command. After each goal it gets another one in the room `next_goals`; none where a trial ends
+    /// at its goal.
+    fn control(&mut self, physics: &mut PhysicsScene, robot: usize, next_goals: Option<&Room>, dt: f32) {
         let pose = physics.pose(robot);
         let is_touching = physics.is_touching(robot);
         self.blocked_s = if is_touching { self.blocked_s + dt } else { 0.0 };
-        if !ends_at_goal && (self.navigator.has_arrived(pose) || self.blocked_s > BLOCKED_LIMIT_S) {
+        if let Some(room) = next_goals
+            && (self.navigator.has_arrived(pose) || self.blocked_s > BLOCKED_LIMIT_S)
+        {
             self.navigator.choose_goal(room, pose);
             self.blocked_s = 0.0;
         }
@@ -260,11 +263,11 @@ impl World {
         let period = self.config.frame_period_s as f32;
         let steps = (period / PHYSICS_STEP_S).ceil().max(1.0);
         let dt = period / steps;
-        let ends_at_goal = !self.parameters.scenario.observer_drives();
+        let next_goals = self.parameters.scenario.observer_drives().then_some(&self.room);
         let mut touched = false;
         for _ in 0..steps as usize {
             for (other, robot) in self.others.iter_mut().zip(1..) {
-                other.control((&self.room, &mut self.physics), robot, ends_at_goal, dt);
+                other.control(&mut self.physics, robot, next_goals, dt);
             }
             self.physics.advance(dt);
             touched |= self.physics.is_touching(0);

@@ -42,14 +42,16 @@ impl Kind {
 }
 
 /// Builds a piece around the place `at` on the floor.
-struct Builder {
+struct Builder<'a> {
     at: [f32; 2],
     /// Whether its longer side lies along y instead of x.
     is_turned: bool,
+    ceiling_m: f32,
+    patterns: &'a [Pattern],
     parts: Vec<Part>,
 }
 
-impl Builder {
+impl Builder<'_> {
     fn turned<T>(&self, [x, y]: [T; 2]) -> [T; 2] {
         if self.is_turned { [y, x] } else { [x, y] }
     }
@@ -104,9 +106,11 @@ pub(super) fn place(kind: Kind, room: &Room, patterns: &[Pattern], random: &mut 
             let mut builder = Builder {
                 at,
                 is_turned,
+                ceiling_m: room.height_m,
+                patterns,
                 parts: Vec::new(),
             };
-            let top_m = build(kind, half_m, room.height_m, patterns, (&mut builder, random));
+            let top_m = builder.build(kind, half_m, random);
             return Some(bounded(builder.parts, footprint, top_m));
         }
     }
@@ -135,52 +139,46 @@ fn half_size(kind: Kind, random: &mut ChaCha8Rng) -> [f32; 2] {
     }
 }
 
-/// Builds a piece of that size; returns its height in metres.
-fn build(
-    kind: Kind,
-    half_m: [f32; 2],
-    ceiling_m: f32,
-    patterns: &[Pattern],
-    (builder, random): (&mut Builder, &mut ChaCha8Rng),
-) -> f32 {
-    let main = walls::material(patterns, 0.15..0.9, random);
-    let gray = random.random_range(0.1..0.9);
-    match kind {
-        Kind::Box => {
-            let top = random.random_range(0.2..1.2);
-            builder.block([0.0; 2], half_m, [0.0, top], main);
-            top
+impl Builder<'_> {
+    /// Builds a piece of that size; returns its height in metres.
+    fn build(&mut self, kind: Kind, half_m: [f32; 2], random: &mut ChaCha8Rng) -> f32 {
+        let main = walls::material(self.patterns, 0.15..0.9, random);
+        let gray = random.random_range(0.1..0.9);
+        match kind {
+            Kind::Box => {
+                let top = random.random_range(0.2..1.2);
+                self.block([0.0; 2], half_m, [0.0, top], main);
+                top
+            }
+            Kind::Table => self.table(half_m, random.random_range(0.45..0.8), main, gray),
+            Kind::Shelf => {
+                let top = random.random_range(0.8..1.9);
+                let has_bricks = self.patterns.contains(&Pattern::Bricks);
+                let pattern = if has_bricks { Pattern::Bricks } else { main.pattern };
+                self.block([0.0; 2], half_m, [0.0, top], Material { pattern, ..main });
+                let on_top = [half_m[0] * 0.98, half_m[1] * 0.6];
+                self.block([0.0; 2], on_top, [top, top + 0.03], Material::plain(gray));
+                top + 0.03
+            }
+            Kind::Pillar => {
+                let reaches_ceiling = random.random_bool(0.7);
+                let top = if reaches_ceiling {
+                    self.ceiling_m
+                } else {
+                    random.random_range(0.3..1.2)
+                };
+                self.cylinder([0.0; 2], half_m[0], [0.0, top], gray);
+                top
+            }
+            Kind::Plant => {
+                let pot = random.random_range(0.2..0.4);
+                self.cylinder([0.0; 2], 0.7 * half_m[0], [0.0, pot], gray);
+                self.leaves(half_m[0], pot + 0.05, random.random_range(0.15..0.4))
+            }
+            Kind::Armchair => self.armchair(half_m, random.random_range(0.75..0.95), main),
         }
-        Kind::Table => builder.table(half_m, random.random_range(0.45..0.8), main, gray),
-        Kind::Shelf => {
-            let top = random.random_range(0.8..1.9);
-            let has_bricks = patterns.contains(&Pattern::Bricks);
-            let pattern = if has_bricks { Pattern::Bricks } else { main.pattern };
-            builder.block([0.0; 2], half_m, [0.0, top], Material { pattern, ..main });
-            let on_top = [half_m[0] * 0.98, half_m[1] * 0.6];
-            builder.block([0.0; 2], on_top, [top, top + 0.03], Material::plain(gray));
-            top + 0.03
-        }
-        Kind::Pillar => {
-            let reaches_ceiling = random.random_bool(0.7);
-            let top = if reaches_ceiling {
-                ceiling_m
-            } else {
-                random.random_range(0.3..1.2)
-            };
-            builder.cylinder([0.0; 2], half_m[0], [0.0, top], gray);
-            top
-        }
-        Kind::Plant => {
-            let pot = random.random_range(0.2..0.4);
-            builder.cylinder([0.0; 2], 0.7 * half_m[0], [0.0, pot], gray);
-            builder.leaves(half_m[0], pot + 0.05, random.random_range(0.15..0.4))
-        }
-        Kind::Armchair => builder.armchair(half_m, random.random_range(0.75..0.95), main),
     }
-}
 
-impl Builder {
     /// A board on four round legs. Returns its height in metres, as do the methods below.
     fn table(&mut self, [half_x, half_y]: [f32; 2], top: f32, board: Material, legs: f32) -> f32 {
         self.block([0.0; 2], [half_x, half_y], [top - 0.05, top], board);
