@@ -15,7 +15,7 @@ use super::JobError;
 use foreframe_core::error_text;
 use foreframe_core::types::{DatasetName, ModelName, Seed, ValueError};
 use foreframe_data::dataset::{self, CollectConfig, CollectionStatus, DatasetError};
-use foreframe_sim::{Scenario, SimError};
+use foreframe_sim::{RoomSet, Scenario, SimError};
 use foreframe_train::evaluation::EvaluateConfig;
 use foreframe_train::training::{TrainConfig, TrainError};
 
@@ -59,6 +59,12 @@ pub struct CollectSpec {
     #[serde(default = "default_seed")]
     #[schema(default = 1)]
     pub seed: u64,
+    /// The set from which each trial draws a room, a camera and robots of its own. Absent: all trials are in the same room.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub rooms: Option<RoomSet>,
+    /// Whether the states hold the true pose instead of the odometry's.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub true_pose: bool,
 }
 
 /// A training: publishes the next version of the model `name`. A cancelled training resumes from its checkpoint.
@@ -250,12 +256,10 @@ impl CollectSpec {
         let scenario = self.scenario.parse();
         let scenario: Scenario =
             scenario.map_err(|error: SimError| JobError::invalid("scenario", error.to_string()))?;
-        Ok(CollectConfig::new(
-            scenario,
-            self.trials,
-            Seed(self.seed),
-            &datasets.join(&self.name),
-        ))
+        let mut config = CollectConfig::new(scenario, self.trials, Seed(self.seed), &datasets.join(&self.name));
+        config.world.rooms = self.rooms;
+        config.world.true_pose = self.true_pose;
+        Ok(config)
     }
 }
 
@@ -359,6 +363,19 @@ mod tests {
         let text = r#"{"kind":"collect","name":"a","scenario":"crowded","trials":1,"colour":"red"}"#;
         let error = serde_json::from_str::<JobSpec>(text).unwrap_err().to_string();
         assert!(error.contains("unknown field `colour`"), "{error}");
+    }
+
+    #[test]
+    fn a_collection_in_rooms_takes_a_known_set() {
+        let spec = |set: &str| serde_json::json!({"name": "a", "scenario": "crowded", "trials": 1, "rooms": set, "true_pose": true});
+        let collect: CollectSpec = serde_json::from_value(spec("new-cameras")).unwrap();
+        let world = collect.config(Path::new("datasets")).unwrap().world;
+        assert_eq!((world.rooms, world.true_pose), (Some(RoomSet::NewCameras), true));
+        assert_eq!(serde_json::to_value(&collect).unwrap()["rooms"], "new-cameras");
+        let error = serde_json::from_value::<CollectSpec>(spec("old"))
+            .unwrap_err()
+            .to_string();
+        assert!(error.contains("varied"), "{error}");
     }
 
     #[test]
