@@ -5,6 +5,8 @@ use candle_core::{Device, Tensor};
 
 use super::error::NnError;
 use super::spec::{ChannelScale, MIN_CHANNEL_STD, ModelSpec};
+use super::tensors::with_values;
+use crate::frame::warp::CameraModel;
 
 /// Conditioning inputs as plain values in the channels' units, empty where the conditioning does not include them.
 pub(super) struct ConditioningValues {
@@ -12,6 +14,8 @@ pub(super) struct ConditioningValues {
     pub(super) actions: Vec<f32>,
     /// `[B, S]`.
     pub(super) states: Vec<f32>,
+    /// `[B, context - 1, S]`; empty too where they are not known.
+    pub(super) past_states: Vec<f32>,
 }
 
 /// The conditioning inputs of a batch, in the units of the channels. An input that the model does not use is ignored; an
@@ -22,6 +26,11 @@ pub struct ConditioningTensors {
     pub actions: Option<Tensor>,
     /// State at the last context frame `[B, S]`.
     pub state: Option<Tensor>,
+    /// States at the context's earlier frames `[B, context - 1, S]`, for networks that estimate depth. Without them, the
+    /// camera counts as having moved as fast as at the last frame.
+    pub past_states: Option<Tensor>,
+    /// The camera of each window, B of them, for networks that estimate depth. Without them, the model's.
+    pub cameras: Vec<CameraModel>,
 }
 
 impl ConditioningTensors {
@@ -60,9 +69,17 @@ impl ConditioningTensors {
                 .map(|(value, channel)| channel.limited(value))
                 .collect())
         };
+        let past_states = match (&self.past_states, spec.state_inputs()) {
+            (Some(past), Some(count)) => {
+                let shape = [batch, spec.context - 1, count];
+                with_values(checked(spec, "past states", Some(past), &shape)?, <[f32]>::to_vec)?
+            }
+            _ => Vec::new(),
+        };
         Ok(ConditioningValues {
             actions: limited(actions, &spec.actions)?,
             states: limited(states, &spec.states)?,
+            past_states,
         })
     }
 
@@ -92,6 +109,9 @@ fn checked<'a>(
                 "[{batch}, {horizon}, {count}]: windows, predicted frames, components {}",
                 names(&spec.actions)
             )
+        }
+        (_, &[batch, frames, count]) => {
+            format!("[{batch}, {frames}, {count}]: windows, earlier frames, components {}", names(&spec.states))
         }
         _ => format!("{shape:?}: windows, components {}", names(&spec.states)),
     };

@@ -14,6 +14,8 @@
 
 mod beyond_horizon;
 mod blocks;
+mod depth;
+mod depth_views;
 mod direct;
 mod encoder_views;
 mod layers;
@@ -21,6 +23,7 @@ mod motion;
 mod network;
 mod predict;
 mod recurrent;
+mod reprojection;
 mod rollout_rows;
 mod room_geometry;
 mod scene;

@@ -227,5 +227,6 @@ fn condition(spec: &ModelSpec, inputs: &[&ConditioningInput], steps: usize) -> R
     Ok(ConditioningTensors {
         actions: tensor(actions.copied().collect(), &[inputs.len(), steps, spec.actions.len()])?,
         state: tensor(states.copied().collect(), &[inputs.len(), spec.states.len()])?,
+        ..ConditioningTensors::none()
     })
 }

@@ -58,8 +58,8 @@ impl<'a> SequenceObjective<'a> {
             let similarity = ssim_loss(&predicted.frames, &targets, width)?;
             loss = (loss + (similarity * sequence.ssim_weight)?)?;
         }
-        if sequence.scene_weight > 0.0 {
-            let scene = sequence.loss.between(&predicted.scene, &batch.targets)?;
+        if let Some(scene) = predicted.scene.filter(|_| sequence.scene_weight > 0.0) {
+            let scene = sequence.loss.between(&scene, &batch.targets)?;
             loss = (loss + (scene * sequence.scene_weight)?)?;
         }
         if sequence.motion_weight > 0.0

@@ -24,7 +24,13 @@ impl FlowNetwork {
             horizon: steps,
             ..spec.clone()
         };
-        let ConditioningValues { actions, mut states } = conditioning.values(&asked, count)?;
+        let ConditioningValues {
+            actions,
+            mut states,
+            past_states,
+        } = conditioning.values(&asked, count)?;
+        // Beyond the first horizon, the camera counts as having moved as fast as at the last frame.
+        let mut past_states = given(&past_states, &[count, spec.context - 1, spec.states.len()])?;
         let mut context = frames.index_select(&Tensor::new(windows, frames.device())?, 0)?;
         let each: Vec<u32> = (0..count as u32).collect();
         let (mut parts, mut done) = (Vec::new(), 0);
@@ -34,6 +40,8 @@ impl FlowNetwork {
             let conditioning = ConditioningTensors {
                 actions: given(&part, &[count, spec.horizon, spec.actions.len()])?,
                 state: given(&states, &[count, spec.states.len()])?,
+                past_states: past_states.take(),
+                cameras: conditioning.cameras.clone(),
             };
             let predicted = self.predict(&context, &each, &conditioning, spec.horizon)?;
             parts.push(predicted.frames.narrow(1, 0, taken)?);

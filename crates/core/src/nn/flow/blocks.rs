@@ -14,6 +14,25 @@ pub(super) fn centred(at: usize, side: usize) -> f32 {
     (2.0 * at as f32 + 1.0) / side as f32 - 1.0
 }
 
+/// The places `[M, H/4, W/4, 2]` on the grid of a quarter of the sides, as the means of the middles of their 4×4 blocks, of
+/// places `[M, P, values]` (columns and rows) that begin at value `first`.
+pub(super) fn coarse_places(places: &[f32], values: usize, first: usize, size: ImageSize) -> Vec<f32> {
+    let quarter = size.shrunk(4);
+    let items = places.chunks_exact(size.pixels() * values);
+    let mut coarse = Vec::with_capacity(items.len() * quarter.pixels() * 2);
+    for item in items {
+        for place in 0..quarter.pixels() {
+            let (row, column) = (place / quarter.width, place % quarter.width);
+            for axis in first..first + 2 {
+                let at = |dy: usize, dx: usize| item[((4 * row + dy) * size.width + 4 * column + dx) * values + axis];
+                let middle = (at(1, 1) + at(2, 2) + at(1, 2) + at(2, 1)) / 4.0;
+                coarse.push((middle - 1.5) / 4.0);
+            }
+        }
+    }
+    coarse
+}
+
 /// Samples a frame at `places` `[P, 2]` and writes each 2×2 block to four channels of its place, from channel `first` on.
 pub(super) fn write_blocks(frame: &[f32], size: ImageSize, places: &[f32], out: &mut [f32], first: usize) {
     let half = size.shrunk(2);

@@ -2,24 +2,26 @@
 
 use candle_core::{Device, Tensor};
 
-use super::blocks::{content_frames, sampled_blocks};
+use super::blocks::{coarse_places, content_frames, sampled_blocks};
 use super::network::{FlowNetwork, FlowPrediction};
 use super::rollout_rows::RolloutRows;
+use super::scene::Scene;
 use crate::nn::error::NnError;
 use crate::nn::geometry::camera::{CameraPose, Viewer, turning_places};
-use crate::nn::ops::compose::{Composition, SCENE_FEATURES};
+use crate::nn::ops::compose::{Composition, RoomPlaces, SCENE_FEATURES};
 use crate::nn::ops::pixel_shuffle::pixel_unshuffle;
 use crate::nn::ops::sampling::{own_places, sample_features};
 use crate::nn::tensors::with_values;
 
 impl FlowNetwork {
     /// All steps of the rollouts at once; gives the frames of the first `steps`.
-    pub(super) fn predict_directly(&self, rows: &RolloutRows, steps: usize) -> Result<FlowPrediction, NnError> {
+    pub(super) fn predict_directly(&self, rows: &RolloutRows, steps: usize, scene: &Scene) -> Result<FlowPrediction, NnError> {
         let size = self.spec.image_size();
         let shape = (rows.count(), self.spec.horizon, size.pixels());
         let motion = self.motion.forward(rows)?;
         let contexts = rows.contexts(self.sizes.layers.frames_read);
-        let coarse = self.encode(&contexts)?;
+        let inputs = contexts.inputs(self.sizes.camera, &scene.content_now(&contexts)?);
+        let [coarse, _] = self.encode(contexts.count(), inputs)?;
 
         let before = rows.poses_before();
         let poses: Vec<CameraPose> = with_values(&motion, |motions| {
@@ -30,9 +32,8 @@ impl FlowNetwork {
                 .map(|(pose, &motion)| pose.moved(motion))
                 .collect()
         })?;
-        let scene = self.scene.forward(rows, &motion, &poses)?;
-
-        let geometry = self.places(&motion.flatten(0, 1)?, &poses, &before)?;
+        let geometry = self.places(&motion.flatten(0, 1)?, &poses, &before, scene)?;
+        let scene = scene.forward(rows, &motion, &poses)?;
         let of_steps = |&context: &u32| std::iter::repeat_n(context, self.spec.horizon);
         let context_of: Vec<u32> = contexts.row_of.iter().flat_map(of_steps).collect();
         let warped = sample_features(&coarse, geometry.coarse, &context_of)?;
@@ -51,18 +52,24 @@ impl FlowNetwork {
             size,
             frames: contexts.last_frames,
             frame_of: context_of,
-            room_places: geometry.room,
+            room: geometry.room.map_or(RoomPlaces::Turned, RoomPlaces::Known),
         };
         let frames = composition.compose(&head, &scene, &geometry.turned)?;
         Ok(FlowPrediction {
             frames: frames.reshape(shape)?.narrow(1, 0, steps)?,
-            scene: content_frames(&scene)?.reshape(shape)?,
+            scene: Some(content_frames(&scene)?.reshape(shape)?),
             motion,
         })
     }
 
     /// Where each item's pixels were in the last frame.
-    fn places(&self, motion: &Tensor, poses: &[CameraPose], before: &[CameraPose]) -> Result<ItemPlaces, NnError> {
+    fn places(
+        &self,
+        motion: &Tensor,
+        poses: &[CameraPose],
+        before: &[CameraPose],
+        scene: &Scene,
+    ) -> Result<ItemPlaces, NnError> {
         let size = self.spec.image_size();
         let Some(camera) = self.sizes.camera.filter(|_| self.motion.is_moving()) else {
             return self.places_without_camera(motion);
@@ -72,7 +79,7 @@ impl FlowNetwork {
         Ok(ItemPlaces {
             turned: turning_places(viewer, &yaw)?,
             coarse: with_values(&yaw, |yaw| Viewer::new(camera, size.shrunk(4)).turned(yaw))?,
-            room: self.scene.room_places(viewer, poses, before)?,
+            room: scene.room_places(viewer, poses, before)?,
         })
     }
 
@@ -80,29 +87,13 @@ impl FlowNetwork {
     /// or every pixel where it is.
     fn places_without_camera(&self, motion: &Tensor) -> Result<ItemPlaces, NnError> {
         let size = self.spec.image_size();
-        let quarter = size.shrunk(4);
         let items = motion.dim(0)?;
         let own = Tensor::from_vec(own_places(size), (1, size.pixels(), 2), &Device::Cpu)?;
         let turned = match self.motion.affine_places(size, motion, &own)? {
             Some(places) => places,
             None => own.broadcast_as((items, size.pixels(), 2))?.contiguous()?,
         };
-        // The coarse places are the means of their blocks.
-        let coarse = |item: &[f32]| {
-            let mut coarse = Vec::with_capacity(quarter.pixels() * 2);
-            for place in 0..quarter.pixels() {
-                let (row, column) = (place / quarter.width, place % quarter.width);
-                for axis in 0..2 {
-                    let at = |dy: usize, dx: usize| item[((4 * row + dy) * size.width + 4 * column + dx) * 2 + axis];
-                    let middle = (at(1, 1) + at(2, 2) + at(1, 2) + at(2, 1)) / 4.0;
-                    coarse.push((middle - 1.5) / 4.0);
-                }
-            }
-            coarse
-        };
-        let coarse = with_values(&turned, |places| {
-            places.chunks_exact(size.pixels() * 2).flat_map(coarse).collect()
-        })?;
+        let coarse = with_values(&turned, |places| coarse_places(places, 2, 0, size))?;
         Ok(ItemPlaces {
             turned,
             coarse,

@@ -22,6 +22,10 @@ pub(super) struct EncoderViews<'a> {
     pub(super) states: Vec<Vec<f32>>,
     /// Where the camera stands then.
     pub(super) poses: Vec<CameraPose>,
+    /// Where it stood at the earlier frames, as seen from there `[contexts, frames_read - 1]`: yaw, ahead, left.
+    pub(super) motions_back: Vec<[f32; 3]>,
+    /// The camera, where it is known.
+    pub(super) cameras: Vec<Option<CameraModel>>,
 }
 
 impl EncoderViews<'_> {

@@ -3,6 +3,8 @@
 use std::collections::BTreeMap;
 
 use super::blocks::MOVED_CHANNELS;
+use super::depth::{FINE_VALUES, MIXED_VALUES};
+use super::depth_views::DepthViews;
 use super::encoder_views::EncoderViews;
 use super::motion::{MOTION_HIDDEN, WHEELS};
 use super::scene::SceneKind;
@@ -39,7 +41,9 @@ pub(in crate::nn) fn tensor_shapes(spec: &ModelSpec, flow: &FlowSpec) -> BTreeMa
         SceneKind::Room(..) => vec![6],
         _ => vec![spec.image_size().shrunk(2).pixels(), SCENE_CHANNELS],
     };
-    shapes.insert(scene.tensor_name().to_owned(), shape);
+    if !flow.layers.depth {
+        shapes.insert(scene.tensor_name().to_owned(), shape);
+    }
     shapes
 }
 
@@ -73,24 +77,23 @@ fn layer_sizes(spec: &ModelSpec, flow: &FlowSpec) -> Vec<LayerSize> {
             rows,
         });
     };
-    layer(
-        "stem",
-        TAPS * EncoderViews::channels(sizes.frames_read),
-        sizes.stem_channels,
-        half,
-    );
+    let read = match sizes.depth {
+        true => DepthViews::channels(sizes.frames_read),
+        false => EncoderViews::channels(sizes.frames_read),
+    };
+    layer("stem", TAPS * read, sizes.stem_channels, half);
     layer("halving", TAPS * sizes.stem_channels, channels, quarter);
     for index in 0..sizes.encoder_blocks {
         for part in ["first", "second"] {
             layer(&format!("encoder.{index}.{part}"), TAPS * channels, channels, quarter);
         }
     }
-    let (actions, states) = (spec.action_inputs(), spec.state_inputs().unwrap_or(0));
+    let (actions, states) = (spec.action_inputs(), StateChannels::read_by_layers(spec).len());
     let known = states + horizon * actions.unwrap_or(0);
     if actions.is_some() {
         layer("motion.inputs", known, MOTION_HIDDEN, 1);
         layer("motion.output", MOTION_HIDDEN, 3 * horizon, 1);
-        if flow.camera.is_none() {
+        if flow.camera.is_none() && !sizes.depth {
             layer("affine", 3, 6, horizon);
         }
     }
@@ -103,14 +106,24 @@ fn layer_sizes(spec: &ModelSpec, flow: &FlowSpec) -> Vec<LayerSize> {
     );
     let modulated = (2 * sizes.decoder_blocks).max(1) * 2 * channels;
     layer("modulation.output", MODULATION_HIDDEN, modulated, horizon);
-    if let Some(inputs) = SceneKind::of(spec, flow.camera).inputs(spec) {
+    let scene = SceneKind::of(spec, flow.camera).inputs(spec).filter(|_| !sizes.depth);
+    if let Some(inputs) = scene {
         // Once for each predicted frame, and once for the last frame seen.
         let rows = (horizon + 1) * half;
         layer("scene.inputs", inputs, sizes.scene_hidden, rows);
         layer("scene.hidden", sizes.scene_hidden, sizes.scene_hidden, rows);
         layer("scene.output", sizes.scene_hidden, SCENE_CHANNELS, rows);
     }
-    let mixed = channels + 4 * SCENE_FEATURES + if sizes.recurrent { FRAME_CHANNELS } else { 0 };
+    if sizes.depth {
+        layer("depth.enlarge", channels, 4 * sizes.enlarged_channels, quarter);
+        layer("depth.output", TAPS * (sizes.enlarged_channels + sizes.stem_channels), 4, half);
+    }
+    let mixed = channels
+        + match (sizes.depth, sizes.recurrent) {
+            (true, _) => MIXED_VALUES,
+            (false, true) => 4 * SCENE_FEATURES + FRAME_CHANNELS,
+            (false, false) => 4 * SCENE_FEATURES,
+        };
     layer(mix_name(sizes), mixed, channels, horizon * quarter);
     for index in 0..sizes.decoder_blocks {
         for part in ["first", "second"] {
@@ -119,7 +132,8 @@ fn layer_sizes(spec: &ModelSpec, flow: &FlowSpec) -> Vec<LayerSize> {
         }
     }
     layer("enlarge", channels, 4 * sizes.enlarged_channels, horizon * quarter);
-    let fine = sizes.enlarged_channels + MOVED_CHANNELS + SCENE_CHANNELS;
+    let beside = if sizes.depth { FINE_VALUES } else { SCENE_CHANNELS };
+    let fine = sizes.enlarged_channels + MOVED_CHANNELS + beside;
     layer("fine", TAPS * fine, sizes.fine_channels, horizon * half);
     layer("head", TAPS * sizes.fine_channels, 4 * HEAD_VALUES, horizon * half);
     layers

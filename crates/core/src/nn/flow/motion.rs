@@ -39,7 +39,7 @@ impl MotionHead {
         Self {
             layers: is_moving.then(layers),
             wheels: (StateChannels::of(spec).commands_speeds()).then(|| tensors.tensor(WHEELS)),
-            affine: (is_moving && sizes.camera.is_none()).then(|| tensors.linear("flow.affine")),
+            affine: (is_moving && sizes.camera.is_none() && !sizes.layers.depth).then(|| tensors.linear("flow.affine")),
         }
     }
 

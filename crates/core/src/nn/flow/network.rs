@@ -3,7 +3,7 @@
 use candle_core::{Device, Tensor};
 use candle_nn::Module as _;
 
-use super::encoder_views::EncoderViews;
+use super::depth::DepthHead;
 use super::layers::mix_name;
 use super::motion::MotionHead;
 use super::rollout_rows::RolloutRows;
@@ -21,10 +21,19 @@ use crate::nn::spec::{FlowSpec, ModelSpec};
 pub struct FlowPrediction {
     /// The predicted frames `[N, steps, P]`, those of the whole horizon unless fewer were asked for.
     pub frames: Tensor,
-    /// What the scene alone looks like `[N, horizon, P]`, without what moves in it.
-    pub scene: Tensor,
+    /// What the scene alone looks like `[N, horizon, P]`, without what moves in it; `None` where the model remembers none.
+    pub scene: Option<Tensor>,
     /// How the camera will have moved since the last frame: yaw, ahead, left `[N, horizon, 3]`, in radians and metres.
     pub motion: Tensor,
+}
+
+/// What the network knows of the surroundings.
+#[derive(Clone, Debug)]
+pub(super) enum Surroundings {
+    /// What they look like, from training.
+    Remembered(Scene),
+    /// How far away they are, from the context.
+    Seen(DepthHead),
 }
 
 /// The network. Holds weights only.
@@ -35,7 +44,7 @@ pub(in crate::nn) struct FlowNetwork {
     stem: Convolution3,
     halving: Convolution3,
     blocks: Vec<[Convolution3; 2]>,
-    pub(super) scene: Scene,
+    pub(super) surroundings: Surroundings,
     pub(super) motion: MotionHead,
     modulation: [Linear; 2],
     pub(super) mix: Linear,
@@ -63,7 +72,10 @@ impl FlowNetwork {
             blocks: (0..layers.encoder_blocks)
                 .map(|index| block(format!("encoder.{index}"), ConvShape::dilated(1 << (index % 3))))
                 .collect(),
-            scene: Scene::new(&spec, sizes.camera, tensors),
+            surroundings: match layers.depth {
+                true => Surroundings::Seen(DepthHead::new(tensors)),
+                false => Surroundings::Remembered(Scene::new(&spec, sizes.camera, tensors)),
+            },
             motion: MotionHead::new(&spec, &sizes, tensors),
             modulation: ["inputs", "output"].map(|part| tensors.linear(&format!("flow.modulation.{part}"))),
             mix: tensors.linear(&format!("flow.{}", mix_name(layers))),
@@ -101,18 +113,18 @@ impl FlowNetwork {
         Ok(self.head.forward(&silu(&self.fine.forward(&inputs)?)?)?)
     }
 
-    /// Features of each context `[contexts, H/4, W/4, C]`.
-    pub(super) fn encode(&self, contexts: &EncoderViews) -> Result<Tensor, NnError> {
+    /// Features of each context `[contexts, H/4, W/4, C]` and those of the first layer `[contexts, H/2, W/2, …]`, from the
+    /// encoder's inputs `[contexts, H/2 · W/2 · …]`.
+    pub(super) fn encode(&self, contexts: usize, inputs: Vec<f32>) -> Result<[Tensor; 2], NnError> {
         let half = self.spec.image_size().shrunk(2);
-        let seen = self.scene.content_now(contexts)?;
-        let inputs = contexts.inputs(self.sizes.camera, &seen);
-        let inputs = Tensor::from_vec(inputs, (contexts.count(), half.height, half.width, ()), &Device::Cpu)?;
-        let mut coarse = self.halving.forward(&silu(&self.stem.forward(&inputs)?)?)?;
+        let inputs = Tensor::from_vec(inputs, (contexts, half.height, half.width, ()), &Device::Cpu)?;
+        let first = silu(&self.stem.forward(&inputs)?)?;
+        let mut coarse = self.halving.forward(&first)?;
         for [first, second] in &self.blocks {
             let inner = second.forward(&silu(&first.forward(&silu(&coarse)?)?)?)?;
             coarse = (coarse + inner)?;
         }
-        Ok(coarse)
+        Ok([coarse, first])
     }
 
     /// Scales and shifts of each item's modulated layers `[M, …]`.

@@ -2,7 +2,7 @@
 
 use candle_core::Tensor;
 
-use super::network::{FlowNetwork, FlowPrediction};
+use super::network::{FlowNetwork, FlowPrediction, Surroundings};
 use super::rollout_rows::RolloutRows;
 use crate::nn::conditioning::ConditioningTensors;
 use crate::nn::error::NnError;
@@ -24,26 +24,27 @@ impl FlowNetwork {
         if rows.count() <= ROLLOUTS_AT_ONCE || self.is_trained() {
             return self.predict_rows(&rows, steps);
         }
-        let (mut frames, mut scene, mut motion) = (Vec::new(), Vec::new(), Vec::new());
+        let mut parts = Vec::new();
         for first in (0..rows.count()).step_by(ROLLOUTS_AT_ONCE) {
             let part = rows.part(first..rows.count().min(first + ROLLOUTS_AT_ONCE));
-            let part = self.predict_rows(&part, steps)?;
-            frames.push(part.frames);
-            scene.push(part.scene);
-            motion.push(part.motion);
+            parts.push(self.predict_rows(&part, steps)?);
         }
+        let joined = |of: fn(&FlowPrediction) -> &Tensor| Tensor::cat(&parts.iter().map(of).collect::<Vec<_>>(), 0);
+        let scenes: Vec<&Tensor> = parts.iter().filter_map(|part| part.scene.as_ref()).collect();
         Ok(FlowPrediction {
-            frames: Tensor::cat(&frames, 0)?,
-            scene: Tensor::cat(&scene, 0)?,
-            motion: Tensor::cat(&motion, 0)?,
+            frames: joined(|part| &part.frames)?,
+            scene: (!scenes.is_empty()).then(|| Tensor::cat(&scenes, 0)).transpose()?,
+            motion: joined(|part| &part.motion)?,
         })
     }
 
     fn predict_rows(&self, rows: &RolloutRows, steps: usize) -> Result<FlowPrediction, NnError> {
-        if self.sizes.layers.recurrent {
-            self.predict_recurrently(rows, steps)
-        } else {
-            self.predict_directly(rows, steps)
+        match &self.surroundings {
+            Surroundings::Seen(depth) => self.predict_with_depth(rows, steps, depth),
+            Surroundings::Remembered(scene) if self.sizes.layers.recurrent => {
+                self.predict_recurrently(rows, steps, scene)
+            }
+            Surroundings::Remembered(scene) => self.predict_directly(rows, steps, scene),
         }
     }
 }

@@ -7,9 +7,10 @@ use candle_core::{DType, Device, Tensor};
 use super::blocks::{MOVED_CHANNELS, content_frames, sampled_blocks};
 use super::network::{FlowNetwork, FlowPrediction};
 use super::rollout_rows::RolloutRows;
+use super::scene::Scene;
 use crate::nn::error::NnError;
 use crate::nn::geometry::camera::CameraPose;
-use crate::nn::ops::compose::{Composition, SCENE_FEATURES};
+use crate::nn::ops::compose::{Composition, RoomPlaces, SCENE_FEATURES};
 use crate::nn::ops::pixel_shuffle::pixel_unshuffle;
 use crate::nn::ops::sampling::{own_places, sample_features};
 use crate::nn::tensors::with_values;
@@ -19,16 +20,17 @@ const BLOCK_PIXELS: usize = MOVED_CHANNELS - 1;
 
 impl FlowNetwork {
     /// The rollouts of a model that takes no actions: its camera stands. Only the first `steps` frames are computed.
-    pub(super) fn predict_recurrently(&self, rows: &RolloutRows, steps: usize) -> Result<FlowPrediction, NnError> {
+    pub(super) fn predict_recurrently(&self, rows: &RolloutRows, steps: usize, scene: &Scene) -> Result<FlowPrediction, NnError> {
         let (count, horizon, size) = (rows.count(), self.spec.horizon, self.spec.image_size());
         let motion = Tensor::zeros((count, horizon, 3), DType::F32, &Device::Cpu)?;
         let contexts = rows.contexts(self.sizes.layers.frames_read);
-        let coarse = self.encode(&contexts)?;
+        let inputs = contexts.inputs(self.sizes.camera, &scene.content_now(&contexts)?);
+        let [coarse, _] = self.encode(contexts.count(), inputs)?;
         let own_coarse = own_places(size.shrunk(4)).repeat(count);
         let mut state = sample_features(&coarse, own_coarse, &contexts.row_of)?;
 
         let poses = vec![CameraPose::default(); count];
-        let scene = self.scene.forward(rows, &motion, &poses)?;
+        let scene = scene.forward(rows, &motion, &poses)?;
         let features = pixel_unshuffle(&scene.narrow(3, 0, SCENE_FEATURES)?)?;
         let modulation = self.modulate(rows, &motion)?.reshape((count, horizon, ()))?;
         let own = own_places(size).repeat(count);
@@ -50,7 +52,7 @@ impl FlowNetwork {
                 size,
                 frames: last_frames,
                 frame_of: each.clone(),
-                room_places: None,
+                room: RoomPlaces::Turned,
             };
             let frame = composition.compose(&head, &scene, &places)?;
             // Intensities end at black and white; what is beyond would grow from step to step.
@@ -61,7 +63,7 @@ impl FlowNetwork {
         let content = content_frames(&scene)?.unsqueeze(1)?;
         Ok(FlowPrediction {
             frames: Tensor::stack(&frames, 1)?,
-            scene: content.broadcast_as((count, horizon, size.pixels()))?.contiguous()?,
+            scene: Some(content.broadcast_as((count, horizon, size.pixels()))?.contiguous()?),
             motion,
         })
     }

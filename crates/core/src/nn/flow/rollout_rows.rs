@@ -6,6 +6,7 @@ use std::sync::Arc;
 use candle_core::{Device, Tensor};
 
 use super::encoder_views::EncoderViews;
+use crate::frame::warp::CameraModel;
 use crate::nn::conditioning::{ConditioningTensors, ConditioningValues};
 use crate::nn::error::NnError;
 use crate::nn::geometry::camera::CameraPose;
@@ -24,6 +25,12 @@ pub(super) struct RolloutRows<'a> {
     actions: Vec<f32>,
     /// `[N, S]`; empty without state.
     states: Vec<f32>,
+    /// `[N, context - 1, S]`; empty where they are not known.
+    past_states: Vec<f32>,
+    /// Of each rollout; empty where the model's counts.
+    cameras: Vec<CameraModel>,
+    /// The channels of the state that the layers read.
+    read: Vec<usize>,
 }
 
 impl<'a> RolloutRows<'a> {
@@ -38,13 +45,25 @@ impl<'a> RolloutRows<'a> {
         if let Some(window) = windows.iter().find(|&&window| window as usize >= count) {
             return Err(candle_core::Error::Msg(format!("there is no window {window}; there are {count}")).into());
         }
-        let ConditioningValues { actions, states } = conditioning.values(spec, windows.len())?;
+        let ConditioningValues {
+            actions,
+            states,
+            past_states,
+        } = conditioning.values(spec, windows.len())?;
+        let cameras = conditioning.cameras.clone();
+        if !(cameras.is_empty() || cameras.len() == windows.len()) {
+            let message = format!("{} cameras do not fit {} rollouts", cameras.len(), windows.len());
+            return Err(candle_core::Error::Msg(message).into());
+        }
         Ok(Self {
             spec,
             frames: Arc::new(with_values(frames, <[f32]>::to_vec)?),
             windows: windows.to_vec(),
             actions,
             states,
+            past_states,
+            cameras,
+            read: StateChannels::read_by_layers(spec),
         })
     }
 
@@ -60,7 +79,10 @@ impl<'a> RolloutRows<'a> {
             frames: Arc::clone(&self.frames),
             windows: self.windows[range.clone()].to_vec(),
             actions: self.of_rows(&self.actions, range.clone()).to_vec(),
-            states: self.of_rows(&self.states, range).to_vec(),
+            states: self.of_rows(&self.states, range.clone()).to_vec(),
+            past_states: self.of_rows(&self.past_states, range.clone()).to_vec(),
+            cameras: self.cameras.get(range).unwrap_or_default().to_vec(),
+            read: self.read.clone(),
         }
     }
 
@@ -77,6 +99,28 @@ impl<'a> RolloutRows<'a> {
     /// The actions of a rollout, step after step; empty where the model takes none.
     pub(super) fn actions(&self, row: usize) -> &[f32] {
         self.of_rows(&self.actions, row..row + 1)
+    }
+
+    /// The camera of a rollout; the model's where it has none of its own.
+    pub(super) fn camera(&self, row: usize) -> Option<CameraModel> {
+        let own = self.cameras.get(row).copied();
+        own.or(self.spec.flow().and_then(|flow| flow.camera))
+    }
+
+    /// Where the camera stood at a frame of a rollout's context, `back` frames before the last one, as seen from there: yaw,
+    /// ahead, left. By the measured poses; else by the speeds at the last frame; else as if it stood.
+    pub(super) fn motion_back(&self, row: usize, back: usize) -> [f32; 3] {
+        let channels = StateChannels::of(self.spec);
+        let (state, past) = (self.state(row), self.of_rows(&self.past_states, row..row + 1));
+        let earlier = (past.len() / state.len().max(1)).checked_sub(back);
+        if let (Some(frame), Some(_)) = (earlier, channels.pose) {
+            let earlier = &past[frame * state.len()..(frame + 1) * state.len()];
+            return self.pose(row).motion_to(channels.pose_in(earlier));
+        }
+        let [forward, yaw_rate] = channels.measured_speeds_in(state).unwrap_or_default();
+        let time = -(self.spec.frame_period_s as f32) * back as f32;
+        let (sin, cos) = (yaw_rate * time / 2.0).sin_cos();
+        [yaw_rate * time, forward * time * cos, forward * time * sin]
     }
 
     /// Where the state says that the camera stands at the last frame of a rollout's context.
@@ -97,7 +141,8 @@ impl<'a> RolloutRows<'a> {
     }
 
     fn scaled_row(&self, row: usize) -> Vec<f32> {
-        let mut scaled = self.spec.scaled_state(self.state(row));
+        let state = self.spec.scaled_state(self.state(row));
+        let mut scaled: Vec<f32> = self.read.iter().map(|&channel| state[channel]).collect();
         let actions = self.actions(row).iter().zip(self.spec.actions.iter().cycle());
         scaled.extend(actions.map(|(value, channel)| channel.scaled(*value)));
         scaled
@@ -119,6 +164,15 @@ impl<'a> RolloutRows<'a> {
         Ok(Tensor::from_vec(values, (self.count() * horizon, ()), &Device::Cpu)?)
     }
 
+    /// Whether two rollouts follow the same context.
+    fn is_same_context(&self, row: usize, other: usize) -> bool {
+        let past = |row: usize| self.of_rows(&self.past_states, row..row + 1);
+        self.windows[row] == self.windows[other]
+            && self.state(row) == self.state(other)
+            && past(row) == past(other)
+            && self.cameras.get(row) == self.cameras.get(other)
+    }
+
     /// The contexts that the rollouts follow, with the last `frames_read` frames of each. Rollouts of one window and state
     /// share one.
     pub(super) fn contexts(&self, frames_read: usize) -> EncoderViews<'a> {
@@ -131,11 +185,11 @@ impl<'a> RolloutRows<'a> {
             earlier: Vec::new(),
             states: Vec::new(),
             poses: Vec::new(),
+            motions_back: Vec::new(),
+            cameras: Vec::new(),
         };
         for row in 0..self.count() {
-            let is_known =
-                row > 0 && self.windows[row] == self.windows[row - 1] && self.state(row) == self.state(row - 1);
-            if !is_known {
+            if row == 0 || !self.is_same_context(row, row - 1) {
                 let frame = |back: usize| {
                     let place = self.windows[row] as usize * context + (context - 1).saturating_sub(back);
                     &self.frames[place * pixels..(place + 1) * pixels]
@@ -146,6 +200,8 @@ impl<'a> RolloutRows<'a> {
                 }
                 views.states.push(self.state(row).to_vec());
                 views.poses.push(self.pose(row));
+                views.motions_back.extend((1..frames_read).map(|back| self.motion_back(row, back)));
+                views.cameras.push(self.camera(row));
             }
             views.row_of.push(views.poses.len() as u32 - 1);
         }

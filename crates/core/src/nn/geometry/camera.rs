@@ -123,19 +123,23 @@ impl Viewer {
         places
     }
 
-    /// How the place of a ray changes with the yaw.
-    fn slope(self, ray: [f32; 3], sin: f32, cos: f32) -> [f32; 2] {
-        let point = rotated(ray, sin, cos);
+    /// Depth of a point in the robot's axes.
+    #[inline(always)]
+    pub(in crate::nn) fn depth(self, point: [f32; 3]) -> f32 {
+        self.depth_and_down(point)[0].max(MIN_DEPTH)
+    }
+
+    /// How the place of a point changes when the point moves along a direction.
+    #[inline(always)]
+    pub(in crate::nn) fn slope(self, point: [f32; 3], along: [f32; 3]) -> [f32; 2] {
         let [depth, down] = self.depth_and_down(point);
         if depth <= MIN_DEPTH {
             return [0.0; 2];
         }
-        let [ahead, left, _] = point;
-        // Of ahead, left, depth and down with the yaw: −left, ahead, and so on.
-        let (depth_slope, down_slope) = (-self.tilt_cos * left, self.tilt_sin * left);
+        let [depth_slope, down_slope] = self.depth_and_down(along);
         let scale = 1.0 / (depth * depth * self.pixel);
         [
-            -(ahead * depth - left * depth_slope) * scale,
+            -(along[1] * depth - point[1] * depth_slope) * scale,
             (down_slope * depth - down * depth_slope) * scale,
         ]
     }
@@ -167,7 +171,8 @@ impl FusedOperation<1> for Viewer {
             let (sin, cos) = yaw.sin_cos();
             let rays = rays.iter().zip(gradient.chunks_exact(2));
             rays.map(|(&ray, gradient)| {
-                let [column, row] = self.slope(ray, sin, cos);
+                let point = rotated(ray, sin, cos);
+                let [column, row] = self.slope(point, [-point[1], point[0], 0.0]);
                 column * gradient[0] + row * gradient[1]
             })
             .sum::<f32>()

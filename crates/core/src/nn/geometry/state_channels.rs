@@ -61,6 +61,23 @@ impl StateChannels {
         self.measured[1].map(|channel| state[channel])
     }
 
+    /// Channels of the state that the network's layers read: not the pose, where it only says how the camera has moved.
+    pub(in crate::nn) fn read_by_layers(spec: &ModelSpec) -> Vec<usize> {
+        let has_depth = spec.flow().is_some_and(|flow| flow.layers.depth);
+        let pose = Self::of(spec).pose.filter(|_| has_depth).unwrap_or([usize::MAX; 4]);
+        (0..spec.state_inputs().unwrap_or(0))
+            .filter(|channel| !pose.contains(channel))
+            .collect()
+    }
+
+    /// Forward speed and yaw rate in a state, if both are measured.
+    pub(in crate::nn) fn measured_speeds_in(self, state: &[f32]) -> Option<[f32; 2]> {
+        match self.measured {
+            [Some(forward), Some(yaw)] => Some([state[forward], state[yaw]]),
+            _ => None,
+        }
+    }
+
     /// Moves a state on: its pose by the motion, its speeds to those of the last action. Other channels stay.
     pub(in crate::nn) fn advance(self, state: &mut [f32], motion: [f32; 3], action: &[f32]) {
         if let Some([x, y, cos, sin]) = self.pose {

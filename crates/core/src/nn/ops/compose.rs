@@ -32,8 +32,18 @@ pub(in crate::nn) struct Composition {
     pub(in crate::nn) frames: Vec<f32>,
     /// Which of them each item moves, `[M]`.
     pub(in crate::nn) frame_of: Vec<u32>,
-    /// Where each pixel of the room was seen, `[M, P, 2]` (columns and rows); the turning grid where absent.
-    pub(in crate::nn) room_places: Option<Vec<f32>>,
+    pub(in crate::nn) room: RoomPlaces,
+}
+
+/// Where each pixel of the room was seen (columns and rows).
+#[derive(Clone)]
+pub(in crate::nn) enum RoomPlaces {
+    /// Where it was before the camera turned.
+    Turned,
+    /// There, `[M, P, 2]`; no gradient goes to them.
+    Known(Vec<f32>),
+    /// In the tensor of places, after the place before the turn; gradients go to them.
+    Tracked,
 }
 
 /// What one pixel is made of.
@@ -47,8 +57,9 @@ struct PixelParts {
 }
 
 impl Composition {
-    /// The frames `[M, P]`. `head` is `[M, H/2, W/2, 4 · HEAD_VALUES]`, `scene` `[M, H/2, W/2, SCENE_CHANNELS]`, `places`
-    /// `[M, P, 2]` where each pixel was before the camera turned. Gradients go to all three.
+    /// The frames `[M, P]`. `head` is `[M, H/2, W/2, 4 · HEAD_VALUES]`, `scene` `[M, H/2, W/2, 4 or more]` with the content in
+    /// its last four channels, `places` `[M, P, 2 or more]` where each pixel was before the camera turned (and, if tracked,
+    /// where it was before it also drove). Gradients go to all three.
     pub(in crate::nn) fn compose(self, head: &Tensor, scene: &Tensor, places: &Tensor) -> Result<Tensor> {
         apply(self, [head, scene, places])
     }
@@ -59,6 +70,7 @@ impl Composition {
     fn visit(&self, [heads, scene, places]: [Operand; 3], mut visit: impl FnMut([usize; 3], PixelParts, &[f32])) {
         let ImageSize { height, width } = self.size;
         let pixels = self.size.pixels();
+        let (scene_channels, place_values) = (last_side(scene), last_side(places));
         for (item, &frame) in self.frame_of.iter().enumerate() {
             let from = frame as usize * pixels;
             let frame = &self.frames[from..from + pixels];
@@ -68,27 +80,25 @@ impl Composition {
                     let part = row % 2 * 2 + column % 2;
                     let pixel = item * pixels + row * width + column;
                     let head = (block * 4 + part) * HEAD_VALUES;
-                    let content = block * SCENE_CHANNELS + SCENE_FEATURES + part;
-                    let place = [places.values[2 * pixel], places.values[2 * pixel + 1]];
+                    let content = (block + 1) * scene_channels - 4 + part;
+                    let at = &places.values[pixel * place_values..(pixel + 1) * place_values];
+                    let turned = [at[0], at[1]];
+                    let room = match &self.room {
+                        RoomPlaces::Turned => turned,
+                        RoomPlaces::Known(room) => [room[2 * pixel], room[2 * pixel + 1]],
+                        RoomPlaces::Tracked => [at[2], at[3]],
+                    };
                     let head_values = &heads.values[head..head + HEAD_VALUES];
-                    let parts = self.parts(pixel, head_values, scene.values[content], place, frame);
+                    let parts = self.parts(head_values, scene.values[content], [room, turned], frame);
                     visit([pixel, head, content], parts, frame);
                 }
             }
         }
     }
 
-    /// The parts of a pixel from its head values, content and turning place.
+    /// The parts of a pixel from its head values, content and places.
     #[inline(always)]
-    #[expect(
-        clippy::too_many_arguments,
-        reason = "the values of one pixel, in the innermost loop"
-    )]
-    fn parts(&self, pixel: usize, head: &[f32], content: f32, turned: [f32; 2], frame: &[f32]) -> PixelParts {
-        let room = match &self.room_places {
-            Some(places) => [places[2 * pixel], places[2 * pixel + 1]],
-            None => turned,
-        };
+    fn parts(&self, head: &[f32], content: f32, [room, turned]: [[f32; 2]; 2], frame: &[f32]) -> PixelParts {
         let around = [
             self.size
                 .around(room[0] + FLOW_PX * head[0], room[1] + FLOW_PX * head[1]),
@@ -122,12 +132,30 @@ impl Composition {
         let (items, ImageSize { height, width }) = (self.frame_of.len(), self.size);
         let [head, scene, places] = inputs.map(|input| input.dims());
         let fits = head == [items, height / 2, width / 2, 4 * HEAD_VALUES]
-            && scene == [items, height / 2, width / 2, SCENE_CHANNELS]
-            && places == [items, height * width, 2];
+            && matches!(*scene, [scenes, h, w, 4..=SCENE_CHANNELS] if [scenes, h, w] == [items, height / 2, width / 2])
+            && matches!(*places, [places, pixels, values] if [places, pixels] == [items, height * width] && values >= self.room.values());
         if fits {
             return Ok(());
         }
         bail!("{items} frames of {width}×{height} are not composed of {head:?}, {scene:?} and {places:?}")
+    }
+}
+
+impl RoomPlaces {
+    /// Values of a pixel in the tensor of places.
+    fn values(&self) -> usize {
+        if matches!(self, Self::Tracked) { 4 } else { 2 }
+    }
+}
+
+fn last_side(operand: Operand) -> usize {
+    operand.dims().last().copied().unwrap_or(1)
+}
+
+#[inline(always)]
+fn add(sums: &mut [f32], values: [f32; 2]) {
+    for (sum, value) in sums.iter_mut().zip(values) {
+        *sum += value;
     }
 }
 
@@ -153,8 +181,7 @@ impl FusedOperation<3> for Composition {
 
     fn backward(&self, inputs: [Operand; 3], _output: Operand, gradient: Operand) -> Result<[Option<Vec<f32>>; 3]> {
         let [mut for_head, mut for_scene, mut for_places] = inputs.map(|input| vec![0.0; input.values.len()]);
-        // With a room, the first flow starts from a place that gets no gradient.
-        let first = usize::from(self.room_places.is_some());
+        let values = last_side(inputs[2]);
         vectorized(
             #[inline(always)]
             || {
@@ -164,9 +191,13 @@ impl FusedOperation<3> for Composition {
                     |[pixel, head, content], parts, frame| {
                         let gradient = gradient.values[pixel];
                         let moved = parts.gradient(gradient, frame, &mut for_head[head..head + HEAD_VALUES]);
-                        for place in &moved[first..] {
-                            for_places[2 * pixel] += place[0];
-                            for_places[2 * pixel + 1] += place[1];
+                        let [room, turned] = moved;
+                        let at = &mut for_places[pixel * values..(pixel + 1) * values];
+                        add(&mut at[..2], turned);
+                        match &self.room {
+                            RoomPlaces::Turned => add(&mut at[..2], room),
+                            RoomPlaces::Known(_) => (),
+                            RoomPlaces::Tracked => add(&mut at[2..4], room),
                         }
                         for_scene[content] = gradient * parts.mask[2];
                     },
@@ -217,7 +248,10 @@ mod tests {
             size,
             frames: values(2 * 24, 1),
             frame_of: vec![0, 1, 1],
-            room_places: with_room.then(|| values(3 * 48, 2).iter().map(|place| 2.5 * place + 2.13).collect()),
+            room: match with_room {
+                true => RoomPlaces::Known(values(3 * 48, 2).iter().map(|place| 2.5 * place + 2.13).collect()),
+                false => RoomPlaces::Turned,
+            },
         }
     }
 
@@ -239,6 +273,22 @@ mod tests {
                 });
             }
         }
+    }
+
+    #[test]
+    fn tracked_places_of_the_room_get_gradients() {
+        let inputs = [
+            (noise(&[3, 2, 3, 32], 3) * 0.3).unwrap(),
+            noise(&[3, 2, 3, 4], 4),
+            noise(&[3, 24, 4], 5).affine(1.2, 1.37).unwrap(),
+        ];
+        assert_gradients(&inputs[2..], 1e-4, |tensors| {
+            let tracked = Composition {
+                room: RoomPlaces::Tracked,
+                ..composition(false)
+            };
+            tracked.compose(&inputs[0], &inputs[1], &tensors[0])
+        });
     }
 
     #[test]

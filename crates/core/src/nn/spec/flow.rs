@@ -40,6 +40,9 @@ pub struct FlowLayers {
     pub scene_hidden: usize,
     /// Frames that the encoder reads: the last ones of the context.
     pub frames_read: usize,
+    /// Whether the depth of what the last frame shows is estimated from the context under its known motion, and the camera
+    /// moved through it, instead of remembering what one place looks like. Such a model reads no absolute pose.
+    pub depth: bool,
     /// Whether each step continues from the state and the frame of the step before it, instead of starting from the last
     /// true frame. Only for models that take no actions.
     pub recurrent: bool,
@@ -56,6 +59,7 @@ impl Default for FlowLayers {
             fine_channels: 16,
             scene_hidden: 48,
             frames_read: 3,
+            depth: false,
             recurrent: false,
         }
     }
@@ -68,7 +72,7 @@ impl FlowSpec {
             camera.validate().map_err(NnError::Camera)?;
         }
         self.layers.check_sizes()?;
-        if self.layers.recurrent && conditioning.has_actions() {
+        if self.layers.recurrent && (conditioning.has_actions() || self.layers.depth) {
             return Err(NnError::RecurrentActions { conditioning });
         }
         let [least, most] = SIDES_PX;

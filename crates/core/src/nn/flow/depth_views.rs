@@ -1,0 +1,226 @@
+//! What the encoder reads to estimate depth: the context's frames in the view of the last one, as far as that can be known
+//! before the depth is, and how much each would shift if things were farther away.
+//!
+//! Frames are counted from the last frame's mean in its spread, so that a darker or brighter room looks the same.
+// A closure's vector instructions reach what is inlined into it, and only that.
+#![allow(clippy::inline_always)]
+
+use super::blocks::centred;
+use super::encoder_views::EncoderViews;
+use crate::frame::warp::CameraModel;
+use crate::nn::geometry::camera::{Viewer, rotated};
+use crate::nn::ops::sampling::ImageSize;
+use crate::vectorized::vectorized;
+
+/// The camera where nothing is known of it.
+const USUAL_CAMERA: CameraModel = CameraModel {
+    horizontal_fov_rad: 1.05,
+    tilt_down_rad: 0.2,
+    height_m: Some(USUAL_HEIGHT_M),
+};
+/// Height of a camera whose height is not known.
+const USUAL_HEIGHT_M: f32 = 0.3;
+/// Distance of everything that the floor does not explain, before anything is learned.
+const WALL_M: f32 = 2.2;
+/// The change of depth whose shift the encoder reads.
+const FARTHER: f32 = 1.25;
+/// Pixels of shift that count as 1.
+const SHIFT_PX: f32 = 4.0;
+/// Smallest spread of a frame's intensities.
+const MIN_SPREAD: f32 = 0.04;
+/// Values of a place: column, row, inverse of the depth before anything is learned.
+pub(super) const PLACE_VALUES: usize = 3;
+
+/// The contexts as the encoder reads them.
+pub(super) struct DepthViews {
+    /// `[contexts, H/2, W/2, channels]`.
+    pub(super) inputs: Vec<f32>,
+    /// The last frames, from mean and in spread `[contexts, P]`.
+    pub(super) frames: Vec<f32>,
+    /// Mean and spread of the last frames.
+    pub(super) levels: Vec<[f32; 2]>,
+    /// Depth before anything is learned `[contexts, P]`, in metres.
+    pub(super) depths: Vec<f32>,
+    /// Column, row and inverse depth of each 2×2 block `[contexts, H/2, W/2, PLACE_VALUES]`.
+    pub(super) places: Vec<f32>,
+    /// The cameras.
+    pub(super) viewers: Vec<Viewer>,
+}
+
+impl DepthViews {
+    /// Channels of the inputs: 2×2 blocks of the frames read, the shift of each earlier one, and the place.
+    pub(super) fn channels(frames_read: usize) -> usize {
+        4 * frames_read + 2 * (frames_read - 1) + PLACE_VALUES
+    }
+
+    pub(super) fn of(contexts: &EncoderViews) -> Self {
+        let size = contexts.spec.image_size();
+        let (half, pixels) = (size.shrunk(2), size.pixels());
+        let channels = Self::channels(contexts.frames_read);
+        let mut views = Self {
+            inputs: vec![0.0; contexts.count() * half.pixels() * channels],
+            frames: contexts.last_frames.clone(),
+            levels: Vec::new(),
+            depths: Vec::new(),
+            places: Vec::new(),
+            viewers: Vec::new(),
+        };
+        let earlier = contexts.frames_read - 1;
+        for index in 0..contexts.count() {
+            let camera = contexts.cameras[index].unwrap_or(USUAL_CAMERA);
+            let viewer = Viewer::new(camera, size);
+            let depths = depths_before_learning(viewer, camera.height_m.unwrap_or(USUAL_HEIGHT_M));
+            let frame = &mut views.frames[index * pixels..(index + 1) * pixels];
+            let levels = levels(frame);
+            count_from(frame, levels);
+            let places = places(size, &depths);
+            let inputs = &mut views.inputs[index * half.pixels() * channels..][..half.pixels() * channels];
+            put_blocks(frame, size, inputs, 0);
+            for back in 0..earlier {
+                let first = (index * earlier + back) * pixels;
+                let mut seen = contexts.earlier[first..first + pixels].to_vec();
+                count_from(&mut seen, levels);
+                let motion = contexts.motions_back[index * earlier + back];
+                let (moved, shifts) = moved_back(viewer, size, &depths, motion, [frame, &seen]);
+                put_blocks(&moved, size, inputs, 4 * (back + 1));
+                put(&shifts, 2, inputs, 4 * (earlier + 1) + 2 * back);
+            }
+            put(&places, PLACE_VALUES, inputs, channels - PLACE_VALUES);
+            views.levels.push(levels);
+            views.depths.extend(depths);
+            views.places.extend(places);
+            views.viewers.push(viewer);
+        }
+        views
+    }
+}
+
+/// Mean and spread of a frame.
+fn levels(frame: &[f32]) -> [f32; 2] {
+    let count = frame.len() as f32;
+    let mean = frame.iter().sum::<f32>() / count;
+    let variance = frame.iter().map(|value| (value - mean).powi(2)).sum::<f32>() / count;
+    [mean, variance.sqrt().max(MIN_SPREAD)]
+}
+
+fn count_from(frame: &mut [f32], [mean, spread]: [f32; 2]) {
+    for value in frame {
+        *value = (*value - mean) / spread;
+    }
+}
+
+/// The depth of each pixel, in metres, if there were only the floor and a wall around the camera.
+fn depths_before_learning(viewer: Viewer, height_m: f32) -> Vec<f32> {
+    let depth = |[ahead, left, up]: [f32; 3]| {
+        let wall = WALL_M / ahead.hypot(left).max(1e-3);
+        if up < 0.0 { wall.min(height_m / -up) } else { wall }
+    };
+    viewer.rays().into_iter().map(depth).collect()
+}
+
+/// Column, row and inverse depth of each 2×2 block.
+fn places(size: ImageSize, depths: &[f32]) -> Vec<f32> {
+    let half = size.shrunk(2);
+    let mut places = Vec::with_capacity(half.pixels() * PLACE_VALUES);
+    for row in 0..half.height {
+        for column in 0..half.width {
+            let depth = |dy: usize, dx: usize| 1.0 / depths[(2 * row + dy) * size.width + 2 * column + dx];
+            let inverse = (depth(0, 0) + depth(0, 1) + depth(1, 0) + depth(1, 1)) / 4.0;
+            places.extend([centred(column, half.width), centred(row, half.height), inverse]);
+        }
+    }
+    places
+}
+
+/// An earlier frame in the view of the last one, for those depths; the last one's pixel where it saw nothing. Beside it,
+/// how far each block would shift if it were farther away.
+fn moved_back(
+    viewer: Viewer,
+    size: ImageSize,
+    depths: &[f32],
+    [yaw, ahead, left]: [f32; 3],
+    [last, earlier]: [&[f32]; 2],
+) -> (Vec<f32>, Vec<f32>) {
+    let (half, rays) = (size.shrunk(2), viewer.rays());
+    let (sin, cos) = (-yaw).sin_cos();
+    let (mut moved, mut shifts) = (last.to_vec(), vec![0.0; half.pixels() * 2]);
+    vectorized(
+        #[inline(always)]
+        || {
+            for (pixel, (&ray, &depth)) in rays.iter().zip(depths).enumerate() {
+                let seen_at = |depth: f32| {
+                    let point = [depth * ray[0] - ahead, depth * ray[1] - left, depth * ray[2]];
+                    viewer.project(rotated(point, sin, cos))
+                };
+                let [x, y] = seen_at(depth);
+                let is_inside =
+                    (-0.5..=size.width as f32 - 0.5).contains(&x) && (-0.5..=size.height as f32 - 0.5).contains(&y);
+                if is_inside {
+                    moved[pixel] = size.around(x, y).sample(earlier);
+                }
+                let farther = seen_at(FARTHER * depth);
+                let block = pixel / size.width / 2 * half.width + pixel % size.width / 2;
+                shifts[2 * block] += shift(farther[0] - x);
+                shifts[2 * block + 1] += shift(farther[1] - y);
+            }
+        },
+    );
+    (moved, shifts)
+}
+
+/// A quarter of a pixel's shift, limited: what is behind the camera would shift without end.
+#[inline(always)]
+fn shift(pixels: f32) -> f32 {
+    (pixels / SHIFT_PX).clamp(-4.0, 4.0) / 4.0
+}
+
+/// Writes each 2×2 block of a frame to four channels of its place, from channel `first` on.
+fn put_blocks(frame: &[f32], size: ImageSize, out: &mut [f32], first: usize) {
+    let half = size.shrunk(2);
+    let channels = out.len() / half.pixels();
+    for (pixel, value) in frame.iter().enumerate() {
+        let (row, column) = (pixel / size.width, pixel % size.width);
+        let block = row / 2 * half.width + column / 2;
+        out[block * channels + first + row % 2 * 2 + column % 2] = *value;
+    }
+}
+
+/// Writes `each` values of each place to its channels from `first` on.
+fn put(values: &[f32], each: usize, out: &mut [f32], first: usize) {
+    let places = values.chunks_exact(each);
+    let channels = out.len() / places.len();
+    for (out, values) in out.chunks_exact_mut(channels).zip(places) {
+        out[first..first + each].copy_from_slice(values);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SIZE: ImageSize = ImageSize { height: 8, width: 8 };
+
+    #[test]
+    fn the_floor_is_as_deep_as_the_camera_is_high() {
+        let camera = CameraModel::new(1.0, 0.3).unwrap();
+        let viewer = Viewer::new(camera, SIZE);
+        let depths = depths_before_learning(viewer, 0.5);
+        let lowest = viewer.rays()[SIZE.pixels() - 1];
+        assert!((depths[SIZE.pixels() - 1] * lowest[2] + 0.5).abs() < 1e-5);
+        assert!((depths[0] * lowest_hypot(viewer.rays()[0]) - WALL_M).abs() < 1e-4);
+    }
+
+    fn lowest_hypot([ahead, left, _]: [f32; 3]) -> f32 {
+        ahead.hypot(left)
+    }
+
+    #[test]
+    fn a_frame_seen_from_the_same_place_stays() {
+        let viewer = Viewer::new(CameraModel::new(1.0, 0.3).unwrap(), SIZE);
+        let frame: Vec<f32> = (0..64).map(|pixel| pixel as f32).collect();
+        let depths = depths_before_learning(viewer, 0.5);
+        let (moved, shifts) = moved_back(viewer, SIZE, &depths, [0.0; 3], [&[0.0; 64], &frame]);
+        assert!(moved.iter().zip(&frame).all(|(a, b)| (a - b).abs() < 1e-3));
+        assert!(shifts.iter().all(|shift| shift.abs() < 1e-4));
+    }
+}

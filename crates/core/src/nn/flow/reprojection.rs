@@ -1,0 +1,238 @@
+//! Where a camera that turned and drove saw each of its pixels before, from the depth of the last frame's pixels.
+//!
+//! The depth is known for the old view and needed in the new one: a pixel's depth is guessed, the point projected into the
+//! old view, and the guess corrected by the depth found there, [`ROUNDS`] times.
+// A closure's vector instructions reach what is inlined into it, and only that.
+#![allow(clippy::inline_always)]
+
+use candle_core::{Result, Shape, Tensor, bail};
+
+use crate::nn::fused::{FusedOperation, Operand, apply};
+use crate::nn::geometry::camera::{Viewer, rotated};
+use crate::nn::ops::sampling::{ImageSize, Neighbourhood};
+use crate::vectorized::vectorized;
+
+/// Values of a pixel: its place before the turn, its place before turn and drive (columns and rows), its depth in metres.
+pub(super) const PLACE_VALUES: usize = 5;
+/// Corrections of a pixel's depth.
+const ROUNDS: usize = 3;
+/// Smallest and largest factor of one correction.
+const CORRECTION: [f32; 2] = [0.5, 2.0];
+
+/// Least change of a pixel's depth in the old view with its depth in the new one, in gradients.
+const MIN_DEEPENING: f32 = 0.2;
+
+/// The places `[M, P, PLACE_VALUES]` of items that follow contexts with these `depths` `[contexts, P]`, after the camera's
+/// `motions` `[M, 3]` (yaw, ahead, left). Gradients go to both.
+pub(super) fn reproject(reprojection: Reprojection, depths: &Tensor, motions: &Tensor) -> Result<Tensor> {
+    apply(reprojection, [depths, motions])
+}
+
+/// What is moved.
+pub(super) struct Reprojection {
+    pub(super) size: ImageSize,
+    /// The camera of each context.
+    pub(super) viewers: Vec<Viewer>,
+    /// The context of each item.
+    pub(super) context_of: Vec<u32>,
+}
+
+/// The motion of an item.
+#[derive(Clone, Copy)]
+struct Motion {
+    sin: f32,
+    cos: f32,
+    ahead: f32,
+    left: f32,
+}
+
+impl Motion {
+    fn of(values: &[f32]) -> Self {
+        let (sin, cos) = values[0].sin_cos();
+        Self {
+            sin,
+            cos,
+            ahead: values[1],
+            left: values[2],
+        }
+    }
+
+    /// The point on a ray of the new view, in the axes of the old one.
+    #[inline(always)]
+    fn point(self, direction: [f32; 3], depth: f32) -> [f32; 3] {
+        [
+            self.ahead + depth * direction[0],
+            self.left + depth * direction[1],
+            depth * direction[2],
+        ]
+    }
+}
+
+/// A pixel's depth after the last correction, and the pixels of the old view around where it was seen.
+struct Found {
+    depth: f32,
+    around: Neighbourhood,
+}
+
+#[inline(always)]
+fn found(viewer: Viewer, size: ImageSize, depths: &[f32], motion: Motion, direction: [f32; 3]) -> Found {
+    let [x, y] = viewer.project(direction);
+    let around = size.around(x, y);
+    let mut found = Found {
+        depth: around.sample(depths),
+        around,
+    };
+    for _ in 0..ROUNDS {
+        let point = motion.point(direction, found.depth);
+        let [x, y] = viewer.project(point);
+        found.around = size.around(x, y);
+        let factor = found.around.sample(depths) / viewer.depth(point);
+        found.depth *= factor.clamp(CORRECTION[0], CORRECTION[1]);
+    }
+    found
+}
+
+impl Reprojection {
+    fn check(&self, depths: Operand, motions: Operand) -> Result<()> {
+        let (contexts, pixels) = depths.layout.shape().dims2()?;
+        let fits = contexts == self.viewers.len()
+            && pixels == self.size.pixels()
+            && motions.dims() == [self.context_of.len(), 3]
+            && self.context_of.iter().all(|&context| (context as usize) < contexts);
+        if fits {
+            return Ok(());
+        }
+        bail!("{:?} depths do not fit {:?} motions", depths.dims(), motions.dims())
+    }
+}
+
+impl FusedOperation<2> for Reprojection {
+    const NAME: &'static str = "reproject";
+
+    fn forward(&self, [depths, motions]: [Operand; 2]) -> Result<(Vec<f32>, Shape)> {
+        self.check(depths, motions)?;
+        let (items, pixels) = (self.context_of.len(), self.size.pixels());
+        let rays: Vec<Vec<[f32; 3]>> = self.viewers.iter().map(|viewer| viewer.rays()).collect();
+        let mut out = vec![0.0; items * pixels * PLACE_VALUES];
+        let outs = out.chunks_exact_mut(pixels * PLACE_VALUES);
+        for ((out, motion), &context) in outs.zip(motions.values.chunks_exact(3)).zip(&self.context_of) {
+            let context = context as usize;
+            let (viewer, motion) = (self.viewers[context], Motion::of(motion));
+            let depths = &depths.values[context * pixels..(context + 1) * pixels];
+            vectorized(
+                #[inline(always)]
+                || {
+                    for (out, &ray) in out.chunks_exact_mut(PLACE_VALUES).zip(&rays[context]) {
+                        let direction = rotated(ray, motion.sin, motion.cos);
+                        let found = found(viewer, self.size, depths, motion, direction);
+                        out[..2].copy_from_slice(&viewer.project(direction));
+                        out[2..4].copy_from_slice(&viewer.project(motion.point(direction, found.depth)));
+                        out[4] = found.depth;
+                    }
+                },
+            );
+        }
+        Ok((out, Shape::from((items, pixels, PLACE_VALUES))))
+    }
+
+    /// As if the surroundings of each place were equally deep, and its depth had settled.
+    fn backward(
+        &self,
+        [depths, motions]: [Operand; 2],
+        _places: Operand,
+        gradient: Operand,
+    ) -> Result<[Option<Vec<f32>>; 2]> {
+        let pixels = self.size.pixels();
+        let rays: Vec<Vec<[f32; 3]>> = self.viewers.iter().map(|viewer| viewer.rays()).collect();
+        let (mut for_depths, mut for_motions) = (vec![0.0; depths.values.len()], vec![0.0; motions.values.len()]);
+        for (item, &context) in self.context_of.iter().enumerate() {
+            let context = context as usize;
+            let (viewer, motion) = (self.viewers[context], Motion::of(&motions.values[3 * item..]));
+            let own = context * pixels..(context + 1) * pixels;
+            let (depths, for_depths) = (&depths.values[own.clone()], &mut for_depths[own]);
+            let gradients = gradient.values[item * pixels * PLACE_VALUES..].chunks_exact(PLACE_VALUES);
+            let mut sums = [0.0f32; 3];
+            for (gradient, &ray) in gradients.zip(&rays[context]) {
+                let direction = rotated(ray, motion.sin, motion.cos);
+                let turn = [-direction[1], direction[0], 0.0];
+                sums[0] += dot(viewer.slope(direction, turn), [gradient[0], gradient[1]]);
+                let room = [gradient[2], gradient[3]];
+                if room == [0.0; 2] {
+                    continue;
+                }
+                let found = found(viewer, self.size, depths, motion, direction);
+                let point = motion.point(direction, found.depth);
+                // The depth in the old view, which is known, is this much of the depth in the new one.
+                let deepens = viewer.depth(direction).max(MIN_DEEPENING);
+                let of_depth = dot(viewer.slope(point, direction), room) / deepens;
+                let turn = turn.map(|part| part * found.depth);
+                let along = [turn, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]];
+                for (sum, along) in sums.iter_mut().zip(along) {
+                    *sum += dot(viewer.slope(point, along), room) - viewer.depth(along) * of_depth;
+                }
+                for (pixel, share) in found.around.pixels.into_iter().zip(found.around.shares()) {
+                    for_depths[pixel] += share * of_depth;
+                }
+            }
+            for_motions[3 * item..3 * item + 3].copy_from_slice(&sums);
+        }
+        Ok([Some(for_depths), Some(for_motions)])
+    }
+}
+
+fn dot(a: [f32; 2], b: [f32; 2]) -> f32 {
+    a[0] * b[0] + a[1] * b[1]
+}
+
+#[cfg(test)]
+mod tests {
+    use candle_core::Device;
+
+    use super::*;
+    use crate::frame::warp::CameraModel;
+    use crate::nn::gradient_check::{assert_gradients, noise};
+
+    const SIZE: ImageSize = ImageSize { height: 6, width: 8 };
+
+    fn reprojection() -> Reprojection {
+        let camera = |fov: f32| CameraModel::new(fov, 0.2).unwrap();
+        Reprojection {
+            size: SIZE,
+            viewers: vec![Viewer::new(camera(1.0), SIZE), Viewer::new(camera(1.3), SIZE)],
+            context_of: vec![0, 1, 1],
+        }
+    }
+
+    /// A wall at that depth.
+    fn wall(depth: f32) -> Tensor {
+        Tensor::full(depth, (2, SIZE.pixels()), &Device::Cpu).unwrap()
+    }
+
+    #[test]
+    fn a_camera_that_drives_to_a_wall_saw_it_smaller() {
+        let motions = Tensor::new(&[[0.0f32, 1.0, 0.0]; 3], &Device::Cpu).unwrap();
+        let flat = Reprojection {
+            viewers: vec![Viewer::new(CameraModel::new(1.0, 0.0).unwrap(), SIZE); 2],
+            ..reprojection()
+        };
+        let places = reproject(flat, &wall(3.0), &motions).unwrap();
+        let places = places.get(0).unwrap().to_vec2::<f32>().unwrap();
+        for (pixel, place) in places.iter().enumerate() {
+            let (x, y) = ((pixel % 8) as f32 - 3.5, (pixel / 8) as f32 - 2.5);
+            // The wall is 2 m away now and was 3 m away.
+            let expected = [x + 3.5, y + 2.5, x * 2.0 / 3.0 + 3.5, y * 2.0 / 3.0 + 2.5, 2.0];
+            assert!(place.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-3), "{place:?} {expected:?}");
+        }
+    }
+
+    #[test]
+    fn gradients_agree_with_differences() {
+        let motions = Tensor::new(&[[0.1f32, 0.03, 0.1], [-0.2, 0.02, 0.0], [0.0, -0.01, 0.05]], &Device::Cpu).unwrap();
+        assert_gradients(&[wall(2.0)], 1e-2, |inputs| {
+            reproject(reprojection(), &inputs[0], &motions)?.narrow(2, 0, 4)
+        });
+        assert_gradients(&[motions.clone()], 1e-2, |inputs| {
+            reproject(reprojection(), &wall(2.0), &inputs[0])?.narrow(2, 0, 4)
+        });
+    }
+}
