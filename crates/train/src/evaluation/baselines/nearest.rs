@@ -19,7 +19,7 @@ const MAX_VALIDATION_WINDOWS: usize = 300;
 /// Exponents to choose from. 0 is the plain mean; the greatest is almost the nearest window alone.
 const EXPONENTS: [f64; 7] = [0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 32.0];
 /// Weights of the actions to choose from.
-const ACTION_WEIGHTS: [f64; 4] = [0.0, 0.01, 0.1, 1.0];
+const ACTION_WEIGHTS: [f64; 6] = [0.0, 0.01, 0.1, 0.3, 1.0, 3.0];
 
 /// The windows that the baseline is made of.
 pub(super) struct WindowSets<'a> {
