@@ -278,7 +278,7 @@ mod tests {
     }
 
     #[test]
-    fn the_nearest_alone_is_chosen_where_everything_repeats() {
+    fn near_windows_weigh_more_where_everything_repeats() {
         let frames: Vec<Vec<u8>> = noise(40).into_iter().cycle().take(160).collect();
         let (dataset, windows) = recording(&frames, &[0.0; 160]);
         // Two copies of each window are in the training half, and many that are alike only by chance.

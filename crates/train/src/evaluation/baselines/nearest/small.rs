@@ -88,7 +88,7 @@ mod tests {
 
     #[test]
     fn a_block_is_the_mean_of_its_pixels_times_the_root_of_their_number() {
-        let frame: Vec<u8> = (0..16 * 16).map(|i| i % 16 / 2).collect();
+        let frame: Vec<u8> = (0..16 * 16).map(|i| (i % 16 / 2) as u8).collect();
         let images = SmallImages::new(16, 16);
         assert_eq!(small(&images, &frame)[..8], [0.0, 2.0, 4.0, 6.0, 8.0, 10.0, 12.0, 14.0]);
         assert_eq!(small(&SmallImages::new(1, 1), &[3]), [3.0]);
