@@ -111,7 +111,7 @@ pub mod evaluation {
     pub use foreframe_train::evaluation::metrics::{BenchmarkScores, MethodScores, StepCurve};
     pub use foreframe_train::evaluation::plans::{PlanIdentification, PlanOutcome};
     pub use foreframe_train::evaluation::report::{
-        ModelSummary, NearestSummary, ReportStamp, SampleWindow, SetOutcome, SetReport, SetScores,
+        ModelSummary, ReportStamp, SampleWindow, SetOutcome, SetReport, SetScores,
     };
     pub use foreframe_train::evaluation::skill::Skill;
     pub use foreframe_train::evaluation::uncertainty::{NoveltyScores, UncertaintyScores};

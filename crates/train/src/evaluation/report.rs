@@ -26,6 +26,7 @@ pub struct EvaluationReport {
     /// The model's sizes.
     pub model: ModelSummary,
     /// What the baseline of the nearest training windows searched and chose; absent where it does not apply.
+    #[doc(hidden)]
     pub nearest_windows: Option<NearestSummary>,
     /// The test sets, or the validation split.
     pub sets: Vec<SetReport>,
