@@ -22,8 +22,8 @@ pub enum Method {
     EgoMotion,
     /// The moving object cut out of the last frame and moved on at constant velocity over the background.
     MovingCutOut,
-    /// The future of the training window whose inputs differ least.
-    NearestWindow,
+    /// The weighted mean of the futures of the 8 training windows whose inputs, and actions to come, differ least.
+    NearestWindows,
     /// Black frames; only for benchmarks whose frames are mostly black.
     Black,
     /// The true future frame through the model's own frame encoder and decoder: about the best it can draw. It reads
@@ -42,7 +42,7 @@ impl Method {
         Self::ConstantShift,
         Self::EgoMotion,
         Self::MovingCutOut,
-        Self::NearestWindow,
+        Self::NearestWindows,
         Self::Black,
         Self::CodecOnly,
     ];
@@ -65,7 +65,7 @@ impl Method {
             Self::ConstantShift => "constant global shift",
             Self::EgoMotion => "commanded ego-motion",
             Self::MovingCutOut => "moving cut-out",
-            Self::NearestWindow => "nearest training window",
+            Self::NearestWindows => "weighted mean of the 8 nearest training windows",
             Self::Black => "black",
             Self::CodecOnly => "codec on the true frame",
         }
