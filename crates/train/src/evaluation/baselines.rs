@@ -1,14 +1,17 @@
 //! The simple predictors that a model must beat.
 
 mod affine_flow;
+mod commanded_motion;
 mod cut_out;
 mod ego_motion;
+mod geometry;
 mod input;
 mod nearest;
 
 use self::affine_flow::AffineFlow;
 use self::cut_out::CutOut;
 use self::ego_motion::CameraTurn;
+use self::geometry::{Geometry, Wall};
 pub(super) use self::input::BaselineInput;
 use self::input::mean;
 use self::nearest::TrainingWindows;
@@ -31,15 +34,16 @@ pub(super) struct Baselines {
     width: usize,
     training_mean: Vec<f32>,
     ego_motion: Option<EgoMotion>,
+    geometry: Option<Geometry>,
     cut_out: CutOut,
     nearest: Option<TrainingWindows>,
 }
 
 impl Baselines {
-    /// Fits the baselines to the training split. Where the data set has no actions there is no ego-motion, and where no
-    /// training window of that shape exists there is no nearest one. All but the mean training frame look only at a limited
-    /// number of windows or frames, evenly spread: the nearest window is one of `searched`. Errors: those of
-    /// [`Splits::windows`] and [`Dataset::pixels`].
+    /// Fits the baselines to the training split. Where the data set has no actions there is no ego-motion, where no training
+    /// window of that shape exists there is no nearest one, and where the camera's height or the commanded speeds are not
+    /// known there is no geometry. All but the mean training frame look only at a limited number of windows or frames, evenly
+    /// spread: the nearest window is one of `searched`. Errors: those of [`Splits::windows`] and [`Dataset::pixels`].
     pub(super) fn fit(
         dataset: &Dataset,
         splits: &Splits,
@@ -51,10 +55,11 @@ impl Baselines {
             Err(DatasetError::WindowTooLong { .. }) => Ok(Vec::new()),
             windows => windows,
         };
-        let ego_motion = match CameraTurn::of(dataset.info()) {
+        let ego_motion = match CameraTurn::of(dataset) {
             Some(turn) => Some(EgoMotion::Turn(turn)),
             None => AffineFlow::fit(dataset, &training_windows(affine_flow::SHAPE)?)?.map(EgoMotion::Flow),
         };
+        let geometry = Geometry::fit(dataset, &training_windows(shape)?, shape)?;
         let nearest = TrainingWindows::new(dataset, &evenly(&training_windows(shape)?, searched), shape)?;
         // Every frame that has a successor in the split.
         let pair = WindowShape { context: 1, horizon: 1 };
@@ -62,6 +67,8 @@ impl Baselines {
         let frames: Vec<usize> = pairs.iter().map(|pair| pair.first_frame).collect();
         let methods = Method::ALL.into_iter().filter(|method| match method {
             Method::EgoMotion => ego_motion.is_some(),
+            Method::GroundAndWall => geometry.is_some(),
+            Method::PlaneSweep => geometry.as_ref().is_some_and(Geometry::can_sweep),
             Method::NearestWindow => nearest.is_some(),
             Method::Black => false,
             _ => true,
@@ -72,6 +79,7 @@ impl Baselines {
             training_mean: mean_frame(dataset, &frames)?,
             cut_out: CutOut::fit(dataset, &frames)?,
             ego_motion,
+            geometry,
             nearest,
         })
     }
@@ -122,6 +130,8 @@ impl Baselines {
                 Some(EgoMotion::Flow(flow)) => flow.predict(input, last),
                 None => Vec::new(),
             },
+            Method::GroundAndWall => self.warped(input, last, Wall::Fitted),
+            Method::PlaneSweep => self.warped(input, last, Wall::Swept),
             Method::MovingCutOut => self.cut_out.predict(input.inputs, horizon),
             Method::NearestWindow => match &self.nearest {
                 Some(windows) => windows.predict(dataset, input.inputs, horizon)?,
@@ -130,6 +140,11 @@ impl Baselines {
             Method::Black => vec![vec![0.0; last.len()]; horizon],
             Method::Model | Method::CodecOnly => Vec::new(),
         })
+    }
+
+    fn warped(&self, input: &BaselineInput, last: &[f32], wall: Wall) -> Vec<Vec<f32>> {
+        let geometry = self.geometry.as_ref();
+        geometry.map_or_else(Vec::new, |geometry| geometry.predict(input, last, wall))
     }
 }
 
@@ -180,6 +195,9 @@ fn mean_frame(dataset: &Dataset, frames: &[usize]) -> Result<Vec<f32>, Evaluatio
     let scale = 1.0 / (255.0 * frames.len().max(1) as f64);
     Ok(sums.into_iter().map(|sum| (sum as f64 * scale) as f32).collect())
 }
+
+#[cfg(test)]
+mod measured;
 
 #[cfg(test)]
 mod tests {

@@ -85,7 +85,8 @@ impl CollectConfig {
             scenario: Some(self.scenario.to_string()),
             seed: Some(self.seed),
             has_masks: true,
-            camera: Some(self.world.camera.model()),
+            // Where trials have their own cameras, no camera model is true of all.
+            camera: self.world.rooms.is_none().then(|| self.world.camera.model()),
             world: Some(self.world.clone()),
             ..DatasetInfo::default()
         }
