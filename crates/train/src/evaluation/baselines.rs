@@ -197,9 +197,6 @@ fn mean_frame(dataset: &Dataset, frames: &[usize]) -> Result<Vec<f32>, Evaluatio
 }
 
 #[cfg(test)]
-mod measured;
-
-#[cfg(test)]
 mod tests {
     use rand::Rng;
 

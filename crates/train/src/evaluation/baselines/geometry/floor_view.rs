@@ -144,6 +144,9 @@ mod tests {
         heading_rad: 0.2,
     };
 
+    /// Between pixels, a frame is interpolated.
+    const INTERPOLATION: f32 = 0.03;
+
     /// The largest difference over the pixels whose places are inside the frame.
     fn difference(values: &[f32], places: &[[f32; 2]], expected: &[f32]) -> f32 {
         let (sampled, inside) = sample(values, SIDE, SIDE, places);
@@ -156,14 +159,14 @@ mod tests {
     fn the_last_frame_shows_what_the_moved_camera_sees() {
         let places = view().places_in_last(MOVED, &[WALL_M; SIDE]);
         let difference = difference(&picture(ORIGIN), &places, &picture(MOVED));
-        assert!(difference < 0.02, "{difference}");
+        assert!(difference < INTERPOLATION, "{difference}");
     }
 
     #[test]
     fn the_frame_of_a_moved_camera_shows_what_the_last_frame_sees() {
         let places = view().places_at(MOVED, WALL_M);
         let difference = difference(&picture(MOVED), &places, &picture(ORIGIN));
-        assert!(difference < 0.02, "{difference}");
+        assert!(difference < INTERPOLATION, "{difference}");
     }
 
     #[test]
