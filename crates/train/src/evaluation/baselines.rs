@@ -11,7 +11,7 @@ mod nearest;
 use self::affine_flow::AffineFlow;
 use self::cut_out::CutOut;
 use self::ego_motion::CameraTurn;
-use self::geometry::{Geometry, Wall};
+use self::geometry::{Geometry, WallDistance};
 pub(super) use self::input::BaselineInput;
 use self::input::mean;
 use self::nearest::TrainingWindows;
@@ -130,8 +130,8 @@ impl Baselines {
                 Some(EgoMotion::Flow(flow)) => flow.predict(input, last),
                 None => Vec::new(),
             },
-            Method::GroundAndWall => self.warped(input, last, Wall::Fitted),
-            Method::PlaneSweep => self.warped(input, last, Wall::Swept),
+            Method::GroundAndWall => self.warped(input, last, WallDistance::Fitted),
+            Method::PlaneSweep => self.warped(input, last, WallDistance::Swept),
             Method::MovingCutOut => self.cut_out.predict(input.inputs, horizon),
             Method::NearestWindow => match &self.nearest {
                 Some(windows) => windows.predict(dataset, input.inputs, horizon)?,
@@ -142,7 +142,7 @@ impl Baselines {
         })
     }
 
-    fn warped(&self, input: &BaselineInput, last: &[f32], wall: Wall) -> Vec<Vec<f32>> {
+    fn warped(&self, input: &BaselineInput, last: &[f32], wall: WallDistance) -> Vec<Vec<f32>> {
         let geometry = self.geometry.as_ref();
         geometry.map_or_else(Vec::new, |geometry| geometry.predict(input, last, wall))
     }

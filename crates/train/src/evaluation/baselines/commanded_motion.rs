@@ -18,7 +18,7 @@ pub(super) const ORIGIN: PlanarPose = PlanarPose {
 
 /// Speeds of the robot.
 #[derive(Clone, Copy)]
-struct Speeds {
+struct RobotSpeeds {
     linear_m_s: f32,
     angular_rad_s: f32,
 }
@@ -41,9 +41,9 @@ impl SpeedChannels {
     }
 
     /// A speed that is not among the values is 0.
-    fn read(self, values: &[f32]) -> Speeds {
+    fn read(self, values: &[f32]) -> RobotSpeeds {
         let value = |channel: usize| values.get(channel).copied().unwrap_or(0.0);
-        Speeds {
+        RobotSpeeds {
             linear_m_s: self.linear.map_or(0.0, value),
             angular_rad_s: value(self.angular),
         }
@@ -102,7 +102,7 @@ struct Wheels {
 }
 
 impl Wheels {
-    fn at(speeds: Speeds) -> Self {
+    fn at(speeds: RobotSpeeds) -> Self {
         let turn = speeds.angular_rad_s * WHEEL_BASE_M / 2.0;
         Self {
             left_m_s: speeds.linear_m_s - turn,
@@ -111,8 +111,8 @@ impl Wheels {
     }
 
     /// Drives for one period towards commanded speeds at the wheels' greatest acceleration; gives the pose after that.
-    fn drive(&mut self, mut pose: PlanarPose, command: Speeds, period_s: f32) -> PlanarPose {
-        let targets = Self::at(Speeds {
+    fn drive(&mut self, mut pose: PlanarPose, command: RobotSpeeds, period_s: f32) -> PlanarPose {
+        let targets = Self::at(RobotSpeeds {
             linear_m_s: command.linear_m_s.clamp(-MAX_LINEAR_M_S, MAX_LINEAR_M_S),
             angular_rad_s: command.angular_rad_s.clamp(-MAX_ANGULAR_RAD_S, MAX_ANGULAR_RAD_S),
         });

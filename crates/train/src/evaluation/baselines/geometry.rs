@@ -36,7 +36,7 @@ fn walls_m() -> [f32; WALLS] {
 
 /// Where the wall stands.
 #[derive(Clone, Copy)]
-pub(super) enum Wall {
+pub(super) enum WallDistance {
     /// At the distance that fits the training split best.
     Fitted,
     /// In each column of the last frame, where the earlier frames show it.
@@ -100,12 +100,12 @@ impl Geometry {
     }
 
     /// One frame for each action of the input; none where the camera's height is not known.
-    pub(super) fn predict(&self, input: &BaselineInput, last: &[f32], wall: Wall) -> Vec<Vec<f32>> {
+    pub(super) fn predict(&self, input: &BaselineInput, last: &[f32], wall: WallDistance) -> Vec<Vec<f32>> {
         let Some(view) = self.view(input) else {
             return Vec::new();
         };
         let walls_m = match (wall, self.odometry) {
-            (Wall::Swept, Some(channels)) => {
+            (WallDistance::Swept, Some(channels)) => {
                 let earlier = input.inputs.iter().zip(&input.past_states);
                 let seen = earlier.map(|(frame, state)| sweep::EarlierFrame {
                     values: frame,
@@ -234,7 +234,7 @@ mod tests {
                 .collect();
             let input = BaselineInput::of_window(&dataset, WINDOW, SHAPE, &inputs);
             let geometry = Geometry::fit(&dataset, &[], SHAPE).unwrap().unwrap();
-            let of_wall = geometry.predict(&input, &last, Wall::Fitted);
+            let of_wall = geometry.predict(&input, &last, WallDistance::Fitted);
             let of_turn = CameraTurn::of(&dataset).unwrap().predict(&input, &last);
             let step = SHAPE.horizon - 1;
             warped += floor_error(&dataset, &of_wall[step], FRAMES - 1);
