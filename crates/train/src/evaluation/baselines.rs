@@ -1,14 +1,17 @@
 //! The simple predictors that a model must beat.
 
 mod affine_flow;
+mod commanded_motion;
 mod cut_out;
 mod ego_motion;
+mod geometry;
 mod input;
 mod nearest;
 
 use self::affine_flow::AffineFlow;
 use self::cut_out::CutOut;
 use self::ego_motion::CameraTurn;
+use self::geometry::{Geometry, WallDistance};
 pub(super) use self::input::BaselineInput;
 use self::input::mean;
 use self::nearest::{NearestWindows, WindowSets};
@@ -31,15 +34,17 @@ pub(super) struct Baselines {
     width: usize,
     training_mean: Vec<f32>,
     ego_motion: Option<EgoMotion>,
+    geometry: Option<Geometry>,
     cut_out: CutOut,
     nearest: Option<NearestWindows>,
 }
 
 impl Baselines {
-    /// Fits the baselines to the training split. Where the data set has no actions there is no ego-motion, and where no
-    /// training window of that shape exists, or none may be `searched`, there are no nearest ones. Ego-motion and cut-out look
-    /// only at a limited number of frames, the nearest windows are among at most `searched`, all evenly spread. The validation
-    /// split serves to weigh the nearest windows. Errors: those of [`Splits::windows`] and [`Dataset::pixels`].
+    /// Fits the baselines to the training split. Where the data set has no actions there is no ego-motion, where no training
+    /// window of that shape exists, or none may be `searched`, there are no nearest ones, and where the camera's height or the
+    /// commanded speeds are not known there is no geometry. Ego-motion, geometry and cut-out look only at a limited number of
+    /// windows or frames, the nearest windows are among at most `searched`, all evenly spread. The validation split serves to
+    /// weigh the nearest windows. Errors: those of [`Splits::windows`] and [`Dataset::pixels`].
     pub(super) fn fit(
         dataset: &Dataset,
         splits: &Splits,
@@ -51,12 +56,14 @@ impl Baselines {
             Err(DatasetError::WindowTooLong { .. }) => Ok(Vec::new()),
             windows => windows,
         };
-        let ego_motion = match CameraTurn::of(dataset.info()) {
+        let ego_motion = match CameraTurn::of(dataset) {
             Some(turn) => Some(EgoMotion::Turn(turn)),
             None => AffineFlow::fit(dataset, &windows_of(Split::Train, affine_flow::SHAPE)?)?.map(EgoMotion::Flow),
         };
+        let training = windows_of(Split::Train, shape)?;
+        let geometry = Geometry::fit(dataset, &training, shape)?;
         let sets = WindowSets {
-            training: &windows_of(Split::Train, shape)?,
+            training: &training,
             validation: &windows_of(Split::Validation, shape)?,
             shape,
             searched,
@@ -68,6 +75,8 @@ impl Baselines {
         let frames: Vec<usize> = pairs.iter().map(|pair| pair.first_frame).collect();
         let methods = Method::ALL.into_iter().filter(|method| match method {
             Method::EgoMotion => ego_motion.is_some(),
+            Method::GroundAndWall => geometry.is_some(),
+            Method::PlaneSweep => geometry.as_ref().is_some_and(Geometry::can_sweep),
             Method::NearestWindows => nearest.is_some(),
             Method::Black => false,
             _ => true,
@@ -78,6 +87,7 @@ impl Baselines {
             training_mean: mean_frame(dataset, &frames)?,
             cut_out: CutOut::fit(dataset, &frames)?,
             ego_motion,
+            geometry,
             nearest,
         })
     }
@@ -133,6 +143,8 @@ impl Baselines {
                 Some(EgoMotion::Flow(flow)) => flow.predict(input, last),
                 None => Vec::new(),
             },
+            Method::GroundAndWall => self.warped(input, last, WallDistance::Fitted),
+            Method::PlaneSweep => self.warped(input, last, WallDistance::Swept),
             Method::MovingCutOut => self.cut_out.predict(input.inputs, horizon),
             Method::NearestWindows => match &self.nearest {
                 Some(windows) => windows.predict(dataset, input, horizon)?,
@@ -141,6 +153,11 @@ impl Baselines {
             Method::Black => vec![vec![0.0; last.len()]; horizon],
             Method::Model | Method::CodecOnly => Vec::new(),
         })
+    }
+
+    fn warped(&self, input: &BaselineInput, last: &[f32], wall: WallDistance) -> Vec<Vec<f32>> {
+        let geometry = self.geometry.as_ref();
+        geometry.map_or_else(Vec::new, |geometry| geometry.predict(input, last, wall))
     }
 }
 
