@@ -51,9 +51,10 @@ pub(super) struct EvaluateArgs {
     /// Windows of each set at most, spread evenly over its trials
     #[arg(long, default_value_t = EvaluateConfig::default().max_windows)]
     windows: usize,
-    /// Training windows among which the baseline looks for the nearest one, at most. Give as many as the model was trained on to
-    /// compare a model of few windows with a baseline that knows as little
-    #[arg(long, value_name = "WINDOWS", default_value_t = NEAREST_WINDOWS as u32, value_parser = value_parser!(u32).range(1..=NEAREST_WINDOWS as i64))]
+    /// Training windows among which the baseline looks for the 8 nearest, at most; evenly spread if there are more. Each takes up
+    /// to 256 bytes of memory for each input frame. Give as many as the model was trained on to compare a model of few windows
+    /// with a baseline that knows as little
+    #[arg(long, value_name = "WINDOWS", default_value_t = NEAREST_WINDOWS as u32, value_parser = value_parser!(u32).range(1..))]
     nearest_windows: u32,
     /// Bootstrap resamples of the trials, for the intervals
     #[arg(long, default_value_t = EvaluateConfig::default().bootstrap_samples as u32, value_parser = value_parser!(u32).range(1..=MAX_RESAMPLES as i64))]

@@ -9,7 +9,7 @@ use foreframe_core::types::Seed;
 use foreframe_data::dataset::{
     CollectConfig, CollectProgress, CollectionStatus, Dataset, DatasetError, DatasetInfo, collect,
 };
-use foreframe_sim::{Scenario, World, WorldConfig};
+use foreframe_sim::{RoomSet, Scenario, World, WorldConfig};
 use proptest::prelude::*;
 use tempfile::TempDir;
 
@@ -335,4 +335,42 @@ fn a_directory_without_a_data_set_is_refused() {
             .to_string()
             .contains("holds no data set (meta/info.json is missing)")
     );
+}
+
+#[test]
+fn the_camera_of_all_trials_has_its_height() {
+    let (_directory, out) = finished();
+    let dataset = Dataset::open(&out).unwrap();
+    let camera = dataset.camera(3).unwrap();
+    assert_eq!(camera.height_m, Some(0.6));
+    // The description has none, so that models are described as before.
+    assert_eq!(
+        dataset.info().camera,
+        Some(CameraModel {
+            height_m: None,
+            ..camera
+        })
+    );
+}
+
+#[test]
+fn in_rooms_of_their_own_episodes_have_their_own_cameras() {
+    let directory = tempfile::tempdir().unwrap();
+    let mut config = config(&directory.path().join("rooms"));
+    config.world.rooms = Some(RoomSet::Varied);
+    config.trials = 4;
+    run(&config).unwrap();
+    let dataset = Dataset::open(&config.out).unwrap();
+    assert_eq!(dataset.info().camera, None);
+    let cameras: Vec<CameraModel> = dataset
+        .episodes()
+        .iter()
+        .map(|episode| {
+            let camera = dataset.camera(episode.index).unwrap();
+            let trial = episode.trial.as_ref().unwrap();
+            assert_eq!(camera, trial.room.as_ref().unwrap().camera.model_with_height());
+            camera
+        })
+        .collect();
+    assert_ne!(cameras[0], cameras[1]);
 }

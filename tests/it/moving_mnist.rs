@@ -299,7 +299,7 @@ fn a_model_is_trained_and_scored_as_papers_do() {
         assert_eq!(benchmark.ssim.per_step.len(), 10);
     }
     let has = |method| scores.methods.iter().any(|row| row.method == method);
-    assert!(has(Method::Black) && !has(Method::NearestWindow));
+    assert!(has(Method::Black) && !has(Method::NearestWindows));
     assert!(report.to_markdown().contains("Squared error, sum over a frame"));
     let error = evaluation::run(&loaded, &seen, &whole, &|_| {})
         .unwrap_err()

@@ -39,13 +39,22 @@ impl CameraConfig {
         in_range("camera.noise_std", self.noise_std, 0.0, 1.0)
     }
 
-    /// How it projects.
+    /// How it projects, without its height.
     #[must_use]
     pub fn model(&self) -> CameraModel {
         CameraModel {
             horizontal_fov_rad: self.horizontal_fov_rad as f32,
             tilt_down_rad: self.tilt_down_rad as f32,
             height_m: None,
+        }
+    }
+
+    /// How it projects, with its height.
+    #[must_use]
+    pub fn model_with_height(&self) -> CameraModel {
+        CameraModel {
+            height_m: Some(self.height_m as f32),
+            ..self.model()
         }
     }
 }

@@ -112,6 +112,7 @@ pub fn run(
         novelty: config.novel.iter().map(compare).collect::<Result<_, _>>()?,
         stamp: ReportStamp::new(&evaluation, split_seed, started.elapsed()),
         model: ModelSummary::of(loaded),
+        nearest_windows: baselines.nearest_summary(),
         sets,
         figures: Vec::new(),
     })
@@ -122,10 +123,10 @@ pub fn run(
 fn fitted_baselines(evaluation: &EvaluationContext, splits: &Splits) -> Result<Baselines, EvaluationError> {
     let (Inference { loaded, dataset }, config) = (evaluation.inference, evaluation.config);
     let (spec, trained_on) = (loaded.spec(), &loaded.manifest.dataset);
-    let fit = |splits: &Splits| Baselines::fit(dataset, splits, window_shape(spec), config.nearest_windows);
+    let fit = |splits: &Splits, searched| Baselines::fit(dataset, splits, window_shape(spec), searched);
     let mut baselines = match config.split {
-        ScoredSplit::WholeSet => fit(&Splits::new(dataset, trained_on.split_seed))?.without(Method::NearestWindow),
-        _ => fit(splits)?,
+        ScoredSplit::WholeSet => fit(&Splits::new(dataset, trained_on.split_seed), 0)?,
+        _ => fit(splits, config.nearest_windows)?,
     };
     let scenarios = [&trained_on.scenario, &dataset.info().scenario];
     if scenarios

@@ -79,32 +79,69 @@ impl CameraModel {
     }
 }
 
+/// A camera that takes frames of some size: the ray of each pixel and the place of each point.
+///
+/// Rays and points are in the robot's axes (x ahead, y to the left, z up); their origin is the pinhole.
+#[derive(Clone, Copy, Debug)]
+pub struct CameraView {
+    tilt_sin: f32,
+    tilt_cos: f32,
+    /// Size of a pixel at depth 1.
+    pixel_size: f32,
+    middle_column: f32,
+    middle_row: f32,
+}
+
+impl CameraView {
+    /// The view of that camera in frames of that size, in pixels.
+    #[must_use]
+    pub fn new(camera: CameraModel, width: usize, height: usize) -> Self {
+        let (tilt_sin, tilt_cos) = camera.tilt_down_rad.sin_cos();
+        Self {
+            tilt_sin,
+            tilt_cos,
+            pixel_size: 2.0 * (camera.horizontal_fov_rad / 2.0).tan() / width as f32,
+            middle_column: width as f32 / 2.0,
+            middle_row: height as f32 / 2.0,
+        }
+    }
+
+    /// The ray through the middle of a pixel; 1 long along the camera's axis.
+    #[must_use]
+    pub fn ray(&self, column: usize, row: usize) -> [f32; 3] {
+        let right = (column as f32 + 0.5 - self.middle_column) * self.pixel_size;
+        let down = (row as f32 + 0.5 - self.middle_row) * self.pixel_size;
+        [
+            self.tilt_cos - down * self.tilt_sin,
+            -right,
+            -self.tilt_sin - down * self.tilt_cos,
+        ]
+    }
+
+    /// The place [column, row] of a point. One beside or behind the camera lies far outside the frame.
+    #[must_use]
+    pub fn project(&self, [ahead, left, up]: [f32; 3]) -> [f32; 2] {
+        let depth = (self.tilt_cos * ahead - self.tilt_sin * up).max(MIN_DEPTH);
+        let down = -(self.tilt_sin * ahead + self.tilt_cos * up);
+        [
+            self.middle_column - left / (depth * self.pixel_size),
+            self.middle_row + down / (depth * self.pixel_size),
+        ]
+    }
+}
+
 /// For each pixel of the view after the camera turned by `yaw_rad` about the vertical (counter-clockwise is positive),
 /// its place in the view before: a grid of width · height coordinates, row by row.
 #[must_use]
 pub fn rotation_grid(camera: CameraModel, width: usize, height: usize, yaw_rad: f32) -> Vec<[f32; 2]> {
-    let pixel_size = 2.0 * (camera.horizontal_fov_rad / 2.0).tan() / width as f32;
-    let (tilt_sin, tilt_cos) = camera.tilt_down_rad.sin_cos();
+    let view = CameraView::new(camera, width, height);
     let (yaw_sin, yaw_cos) = yaw_rad.sin_cos();
-    let (middle_column, middle_row) = (width as f32 / 2.0, height as f32 / 2.0);
     let mut grid = Vec::with_capacity(width * height);
     for row in 0..height {
         for column in 0..width {
-            // The pixel's ray after the turn, in the robot's axes then: x ahead, y to the left, z up.
-            let right = (column as f32 + 0.5 - middle_column) * pixel_size;
-            let down = (row as f32 + 0.5 - middle_row) * pixel_size;
-            let ahead = tilt_cos - down * tilt_sin;
-            let left = -right;
-            let up = -tilt_sin - down * tilt_cos;
-            // The same ray in the robot's axes before the turn, seen by the camera as it looked then.
-            let ahead_before = yaw_cos * ahead - yaw_sin * left;
-            let left_before = yaw_sin * ahead + yaw_cos * left;
-            let depth = (tilt_cos * ahead_before - tilt_sin * up).max(MIN_DEPTH);
-            let down_before = -(tilt_sin * ahead_before + tilt_cos * up);
-            grid.push([
-                middle_column - left_before / (depth * pixel_size),
-                middle_row + down_before / (depth * pixel_size),
-            ]);
+            // The pixel's ray after the turn, in the robot's axes then and in those before the turn.
+            let [ahead, left, up] = view.ray(column, row);
+            grid.push(view.project([yaw_cos * ahead - yaw_sin * left, yaw_sin * ahead + yaw_cos * left, up]));
         }
     }
     grid

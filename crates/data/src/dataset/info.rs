@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use foreframe_core::frame::warp::CameraModel;
 use foreframe_core::types::{Channel, Seed};
-use foreframe_sim::{TrialParameters, WorldConfig};
+use foreframe_sim::{CameraConfig, TrialParameters, WorldConfig};
 
 /// Description of a data set: frame size, frame period, channels, origin and the hash of its content. The fields in the order
 /// of the metadata file.
@@ -30,7 +30,8 @@ pub struct DatasetInfo {
     pub state_channels: Vec<Channel>,
     /// Whether every frame has a mask; filled in by [`Dataset::from_episodes`](super::Dataset::from_episodes).
     pub has_masks: bool,
-    /// How the camera projects; none where that is not known.
+    /// How the camera of all episodes projects; none where that is not known, or where each trial has a camera of its own
+    /// ([`Dataset::camera`](super::Dataset::camera)).
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub camera: Option<CameraModel>,
     /// SHA-256 of the content, in hexadecimal. [`Dataset::from_episodes`](super::Dataset::from_episodes) computes it if this is empty.
@@ -51,6 +52,12 @@ impl DatasetInfo {
     #[must_use]
     pub fn frame_pixels(&self) -> usize {
         self.frame_width_px as usize * self.frame_height_px as usize
+    }
+
+    /// The simulated camera, where it is the same in all trials.
+    pub(super) fn common_camera(&self) -> Option<&CameraConfig> {
+        let world = self.world.as_ref().filter(|world| world.rooms.is_none());
+        world.map(|world| &world.camera)
     }
 
     /// Number of frames and masks.

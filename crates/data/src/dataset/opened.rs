@@ -10,6 +10,8 @@ use super::frame_store::frame_file::FrameFile;
 use super::frame_store::{FrameContent, FrameStore};
 use super::{DatasetError, DatasetInfo, Episode, EpisodeData};
 use foreframe_core::frame::Frame;
+use foreframe_core::frame::warp::CameraModel;
+use foreframe_sim::CameraConfig;
 
 /// An open data set.
 #[derive(Clone, Debug, PartialEq)]
@@ -122,6 +124,16 @@ impl Dataset {
     #[must_use]
     pub fn episodes(&self) -> &[Episode] {
         &self.episodes
+    }
+
+    /// The camera of an episode: that of its trial, else the one of all trials, both with their height, else the one in the
+    /// description. None where no camera is known.
+    #[must_use]
+    pub fn camera(&self, episode: usize) -> Option<CameraModel> {
+        let trial = self.episodes.get(episode).and_then(|episode| episode.trial.as_ref());
+        let own = trial.and_then(|trial| trial.room.as_ref()).map(|room| &room.camera);
+        let simulated = own.or_else(|| self.info.common_camera());
+        simulated.map(CameraConfig::model_with_height).or(self.info.camera)
     }
 
     /// The intensities of a frame, row by row: borrowed from memory, or read from the file of decoded frames. Panics if there

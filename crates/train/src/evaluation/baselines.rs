@@ -1,20 +1,23 @@
 //! The simple predictors that a model must beat.
 
 mod affine_flow;
+mod commanded_motion;
 mod cut_out;
 mod ego_motion;
+mod geometry;
 mod input;
 mod nearest;
 
 use self::affine_flow::AffineFlow;
 use self::cut_out::CutOut;
 use self::ego_motion::CameraTurn;
+use self::geometry::{Geometry, WallDistance};
 pub(super) use self::input::BaselineInput;
 use self::input::mean;
-use self::nearest::TrainingWindows;
+use self::nearest::{NearestWindows, WindowSets};
 use super::EvaluationError;
 use super::method::Method;
-use super::windows::evenly;
+use super::report::NearestSummary;
 use foreframe_data::dataset::sampler::{Split, Splits, WindowShape};
 use foreframe_data::dataset::{Dataset, DatasetError};
 use foreframe_data::motion::{Shift, phase_correlation, shifted};
@@ -31,15 +34,17 @@ pub(super) struct Baselines {
     width: usize,
     training_mean: Vec<f32>,
     ego_motion: Option<EgoMotion>,
+    geometry: Option<Geometry>,
     cut_out: CutOut,
-    nearest: Option<TrainingWindows>,
+    nearest: Option<NearestWindows>,
 }
 
 impl Baselines {
-    /// Fits the baselines to the training split. Where the data set has no actions there is no ego-motion, and where no
-    /// training window of that shape exists there is no nearest one. All but the mean training frame look only at a limited
-    /// number of windows or frames, evenly spread: the nearest window is one of `searched`. Errors: those of
-    /// [`Splits::windows`] and [`Dataset::pixels`].
+    /// Fits the baselines to the training split. Where the data set has no actions there is no ego-motion, where no training
+    /// window of that shape exists, or none may be `searched`, there are no nearest ones, and where the camera's height or the
+    /// commanded speeds are not known there is no geometry. Ego-motion, geometry and cut-out look only at a limited number of
+    /// windows or frames, the nearest windows are among at most `searched`, all evenly spread. The validation split serves to
+    /// weigh the nearest windows. Errors: those of [`Splits::windows`] and [`Dataset::pixels`].
     pub(super) fn fit(
         dataset: &Dataset,
         splits: &Splits,
@@ -47,22 +52,32 @@ impl Baselines {
         searched: usize,
     ) -> Result<Self, EvaluationError> {
         // None where no window of that shape fits.
-        let training_windows = |shape| match splits.windows(dataset, Split::Train, shape, 1) {
+        let windows_of = |split, shape| match splits.windows(dataset, split, shape, 1) {
             Err(DatasetError::WindowTooLong { .. }) => Ok(Vec::new()),
             windows => windows,
         };
-        let ego_motion = match CameraTurn::of(dataset.info()) {
+        let ego_motion = match CameraTurn::of(dataset) {
             Some(turn) => Some(EgoMotion::Turn(turn)),
-            None => AffineFlow::fit(dataset, &training_windows(affine_flow::SHAPE)?)?.map(EgoMotion::Flow),
+            None => AffineFlow::fit(dataset, &windows_of(Split::Train, affine_flow::SHAPE)?)?.map(EgoMotion::Flow),
         };
-        let nearest = TrainingWindows::new(dataset, &evenly(&training_windows(shape)?, searched), shape)?;
+        let training = windows_of(Split::Train, shape)?;
+        let geometry = Geometry::fit(dataset, &training, shape)?;
+        let sets = WindowSets {
+            training: &training,
+            validation: &windows_of(Split::Validation, shape)?,
+            shape,
+            searched,
+        };
+        let nearest = NearestWindows::fit(dataset, &sets)?;
         // Every frame that has a successor in the split.
         let pair = WindowShape { context: 1, horizon: 1 };
         let pairs = splits.windows(dataset, Split::Train, pair, 1)?;
         let frames: Vec<usize> = pairs.iter().map(|pair| pair.first_frame).collect();
         let methods = Method::ALL.into_iter().filter(|method| match method {
             Method::EgoMotion => ego_motion.is_some(),
-            Method::NearestWindow => nearest.is_some(),
+            Method::GroundAndWall => geometry.is_some(),
+            Method::PlaneSweep => geometry.as_ref().is_some_and(Geometry::can_sweep),
+            Method::NearestWindows => nearest.is_some(),
             Method::Black => false,
             _ => true,
         });
@@ -72,6 +87,7 @@ impl Baselines {
             training_mean: mean_frame(dataset, &frames)?,
             cut_out: CutOut::fit(dataset, &frames)?,
             ego_motion,
+            geometry,
             nearest,
         })
     }
@@ -99,6 +115,11 @@ impl Baselines {
         &self.methods
     }
 
+    /// What the nearest windows are searched among, if that baseline applies.
+    pub(super) fn nearest_summary(&self) -> Option<NearestSummary> {
+        self.nearest.as_ref().map(NearestWindows::summary)
+    }
+
     /// The frames 1…`horizon` steps ahead as a baseline predicts them; none for a method that is no baseline or that does
     /// not apply to the data set. Errors: those of [`Dataset::pixels`].
     pub(super) fn predict(
@@ -122,14 +143,21 @@ impl Baselines {
                 Some(EgoMotion::Flow(flow)) => flow.predict(input, last),
                 None => Vec::new(),
             },
+            Method::GroundAndWall => self.warped(input, last, WallDistance::Fitted),
+            Method::PlaneSweep => self.warped(input, last, WallDistance::Swept),
             Method::MovingCutOut => self.cut_out.predict(input.inputs, horizon),
-            Method::NearestWindow => match &self.nearest {
-                Some(windows) => windows.predict(dataset, input.inputs, horizon)?,
+            Method::NearestWindows => match &self.nearest {
+                Some(windows) => windows.predict(dataset, input, horizon)?,
                 None => Vec::new(),
             },
             Method::Black => vec![vec![0.0; last.len()]; horizon],
             Method::Model | Method::CodecOnly => Vec::new(),
         })
+    }
+
+    fn warped(&self, input: &BaselineInput, last: &[f32], wall: WallDistance) -> Vec<Vec<f32>> {
+        let geometry = self.geometry.as_ref();
+        geometry.map_or_else(Vec::new, |geometry| geometry.predict(input, last, wall))
     }
 }
 
@@ -231,7 +259,7 @@ mod tests {
         error_among(usize::MAX, method, dataset)
     }
 
-    /// Mean error of a method over the test windows, where the nearest window is one of `searched`.
+    /// Mean error of a method over the test windows, where the nearest windows are among `searched`.
     fn error_among(searched: usize, method: Method, dataset: &Dataset) -> f64 {
         let (baselines, splits) = fitted(dataset, searched);
         let windows = splits.windows(dataset, Split::Test, SHAPE, 1).unwrap();
@@ -363,8 +391,12 @@ mod tests {
             (0..SIDE * SIDE).map(|_| rng.random()).collect()
         };
         let dataset = recordings(SIDE, frame, |_, _| 0.0);
-        assert!(error_of(Method::NearestWindow, &dataset) < 1e-6);
-        assert!(error_among(1, Method::NearestWindow, &dataset) > 0.1);
+        assert!(error_of(Method::NearestWindows, &dataset) < 1e-6);
+        let summary = fitted(&dataset, usize::MAX).0.nearest_summary().unwrap();
+        assert_eq!(summary.searched, summary.available);
+        assert!(error_among(1, Method::NearestWindows, &dataset) > 0.1);
+        let summary = fitted(&dataset, 1).0.nearest_summary().unwrap();
+        assert!(summary.searched == 1 && summary.available > 1);
         assert!(error_of(Method::CopyLast, &dataset) > 0.1);
     }
 }

@@ -44,8 +44,9 @@ impl ScoredSplit {
     }
 }
 
-/// Training windows among which the nearest-window baseline looks, unless other numbers are asked for.
-pub const NEAREST_WINDOWS: usize = 15_000;
+/// Training windows among which the baseline looks for the nearest ones at most, unless another number is asked for: all of
+/// most data sets. Each takes up to 256 bytes of memory for each input frame; where all are searched, they share their frames.
+pub const NEAREST_WINDOWS: usize = 200_000;
 
 /// What to test on, and how closely.
 #[derive(Clone)]
@@ -58,7 +59,7 @@ pub struct EvaluateConfig<'a> {
     pub stride: usize,
     /// Windows of each set at most, evenly spread over its trials.
     pub max_windows: usize,
-    /// Training windows among which the baseline looks for the nearest one, at most, evenly spread.
+    /// Training windows among which the baseline looks for the nearest ones, at most, evenly spread.
     pub nearest_windows: usize,
     /// Resamples for the intervals.
     pub bootstrap_samples: usize,

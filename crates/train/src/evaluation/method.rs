@@ -20,10 +20,14 @@ pub enum Method {
     ConstantShift,
     /// The last frame warped by the camera's own motion, which follows from the commanded actions.
     EgoMotion,
+    /// The last frame warped by the camera's motion over a flat floor, towards a wall at the distance that fits training best.
+    GroundAndWall,
+    /// The same with a wall whose distance in each column follows from the input frames.
+    PlaneSweep,
     /// The moving object cut out of the last frame and moved on at constant velocity over the background.
     MovingCutOut,
-    /// The future of the training window whose inputs differ least.
-    NearestWindow,
+    /// The weighted mean of the futures of the 8 training windows whose inputs, and actions to come, differ least.
+    NearestWindows,
     /// Black frames; only for benchmarks whose frames are mostly black.
     Black,
     /// The true future frame through the model's own frame encoder and decoder: about the best it can draw. It reads
@@ -33,7 +37,7 @@ pub enum Method {
 
 impl Method {
     /// All rows, in the order of the tables.
-    pub const ALL: [Self; 11] = [
+    pub const ALL: [Self; 13] = [
         Self::Model,
         Self::CopyLast,
         Self::MeanOfInputs,
@@ -41,8 +45,10 @@ impl Method {
         Self::LinearExtrapolation,
         Self::ConstantShift,
         Self::EgoMotion,
+        Self::GroundAndWall,
+        Self::PlaneSweep,
         Self::MovingCutOut,
-        Self::NearestWindow,
+        Self::NearestWindows,
         Self::Black,
         Self::CodecOnly,
     ];
@@ -64,8 +70,10 @@ impl Method {
             Self::LinearExtrapolation => "linear extrapolation",
             Self::ConstantShift => "constant global shift",
             Self::EgoMotion => "commanded ego-motion",
+            Self::GroundAndWall => "ground plane and wall",
+            Self::PlaneSweep => "plane sweep",
             Self::MovingCutOut => "moving cut-out",
-            Self::NearestWindow => "nearest training window",
+            Self::NearestWindows => "weighted mean of the 8 nearest training windows",
             Self::Black => "black",
             Self::CodecOnly => "codec on the true frame",
         }

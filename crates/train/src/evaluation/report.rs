@@ -7,7 +7,7 @@ use serde_json::{Map, Value, json};
 
 use super::actions::ActionTable;
 use super::bootstrap::{Bootstrap, TrialSums};
-use super::config::{NEAREST_WINDOWS, ScoredSplit};
+use super::config::ScoredSplit;
 use super::method::Method;
 use super::metrics::{MethodScores, StepCurve, WindowScores, summarize};
 use super::plans::PlanOutcome;
@@ -25,6 +25,9 @@ pub struct EvaluationReport {
     pub stamp: ReportStamp,
     /// The model's sizes.
     pub model: ModelSummary,
+    /// What the baseline of the nearest training windows searched and chose; absent where it does not apply.
+    #[doc(hidden)]
+    pub nearest_windows: Option<NearestSummary>,
     /// The test sets, or the validation split.
     pub sets: Vec<SetReport>,
     /// How well the model's novelty tells other data sets from its own; empty if none were given.
@@ -103,9 +106,6 @@ pub struct ReportStamp {
     pub command: String,
     /// Frames from the start of one window to that of the next.
     pub stride: usize,
-    /// Training windows among which the baseline looked for the nearest one, at most.
-    #[serde(default = "nearest_windows")]
-    pub nearest_windows: usize,
     /// Resamples for the intervals.
     pub bootstrap_samples: usize,
     /// Seed of the resamples and of the shuffled actions.
@@ -134,7 +134,6 @@ impl ReportStamp {
             program: ProgramStamp::current(),
             command: config.command.clone(),
             stride: config.stride,
-            nearest_windows: config.nearest_windows,
             bootstrap_samples: config.bootstrap_samples,
             seed: config.seed,
             wall_time_s: wall_time.as_secs_f64(),
@@ -142,11 +141,6 @@ impl ReportStamp {
             threads: rayon::current_num_threads(),
         }
     }
-}
-
-/// Of reports from before this number was a setting.
-fn nearest_windows() -> usize {
-    NEAREST_WINDOWS
 }
 
 /// From `/proc/cpuinfo`; the architecture where that does not exist.
@@ -198,6 +192,22 @@ impl ModelSummary {
             trained_on: loaded.manifest.dataset.clone(),
         }
     }
+}
+
+/// What the baseline of the nearest training windows searched, and how it weighs them.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct NearestSummary {
+    /// Training windows that are searched.
+    pub searched: usize,
+    /// Training windows that there are.
+    pub available: usize,
+    /// Validation windows by which the two numbers below were chosen; 0 where there are none.
+    pub validation_windows: usize,
+    /// A neighbour's weight is 1 / distance to the power of this.
+    pub exponent: f64,
+    /// Weight of the actions in the distance: at 1, a difference of one standard deviation counts as much in all actions as
+    /// in all images. 0 where the data set has no actions.
+    pub action_weight: f64,
 }
 
 /// One test set.

@@ -95,7 +95,7 @@ mod tests {
         seed: Seed(5),
     };
 
-    const BASELINES: i32 = 9;
+    const BASELINES: i32 = 11;
 
     /// Two steps; every baseline errs by 0.1 · (1 + its row), times the trial's difficulty.
     fn windows(model: impl Fn(f64) -> f64) -> Vec<WindowScores> {

@@ -133,13 +133,11 @@ impl DatasetMetadata {
     }
 
     /// The description of the data set in that directory. Metadata of older data sets have no camera model; it is then taken
-    /// from the arguments of the collection. Errors: `Corrupt`, `Io`.
+    /// from the arguments of the collection, unless each trial has a camera of its own. Errors: `Corrupt`, `Io`.
     pub(crate) fn info_in(&self, directory: &Path) -> Result<DatasetInfo, DatasetError> {
         let mut info = self.info();
         info.world = collected_world(directory)?;
-        let same_camera = info.world.as_ref().filter(|world| world.rooms.is_none());
-        let camera = same_camera.map(|world| &world.camera);
-        info.camera = info.camera.or(camera.map(CameraConfig::model));
+        info.camera = info.camera.or(info.common_camera().map(CameraConfig::model));
         Ok(info)
     }
 

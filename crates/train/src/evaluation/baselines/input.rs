@@ -1,9 +1,11 @@
 //! What a baseline may look at.
 
+use foreframe_core::frame::warp::CameraModel;
 use foreframe_data::dataset::sampler::WindowShape;
 use foreframe_data::dataset::{Dataset, Window};
 
 /// What a baseline may look at. Frames hold intensities 0…1 in the camera's space.
+#[derive(Default)]
 pub(in crate::evaluation) struct BaselineInput<'a> {
     /// The input frames, oldest first; at least one.
     pub(super) inputs: &'a [Vec<f32>],
@@ -13,6 +15,10 @@ pub(in crate::evaluation) struct BaselineInput<'a> {
     pub(super) actions: Vec<&'a [f32]>,
     /// The state at the last input frame.
     pub(super) state: &'a [f32],
+    /// The states at the input frames before the last one, oldest first.
+    pub(super) past_states: Vec<&'a [f32]>,
+    /// The camera that took the frames; none where it is not known.
+    pub(super) camera: Option<CameraModel>,
 }
 
 impl<'a> BaselineInput<'a> {
@@ -31,6 +37,8 @@ impl<'a> BaselineInput<'a> {
                 .map(|frame| dataset.action(frame))
                 .collect(),
             state: dataset.state(last),
+            past_states: (window.first_frame..last).map(|frame| dataset.state(frame)).collect(),
+            camera: dataset.camera(window.episode),
         }
     }
 }

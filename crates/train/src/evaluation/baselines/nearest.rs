@@ -1,155 +1,308 @@
-//! The training window whose inputs differ least, and its future.
+//! The weighted mean of the futures of the training windows whose inputs, and actions to come, differ least.
+
+mod search;
+mod small;
 
 use rayon::prelude::*;
 
+use self::search::{Neighbour, TrainingWindows};
+use super::input::BaselineInput;
 use crate::evaluation::EvaluationError;
-use crate::evaluation::windows::true_frame;
+use crate::evaluation::report::NearestSummary;
+use crate::evaluation::windows::{evenly, true_frame};
+use foreframe_core::frame::quality::mse;
 use foreframe_data::dataset::sampler::WindowShape;
 use foreframe_data::dataset::{Dataset, Window};
 
-/// Sides of the small image that frames are compared by first.
-const SMALL_SIDE: usize = 8;
-/// Windows that are compared pixel by pixel at most.
-const MAX_CANDIDATES: usize = 64;
+/// Validation windows by which the weights are chosen at most, evenly spread.
+const MAX_VALIDATION_WINDOWS: usize = 300;
+/// Exponents to choose from. 0 is the plain mean; the greatest is almost the nearest window alone.
+const EXPONENTS: [f64; 7] = [0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 32.0];
+/// Weights of the actions to choose from.
+const ACTION_WEIGHTS: [f64; 6] = [0.0, 0.01, 0.1, 0.3, 1.0, 3.0];
 
-/// Training windows with their inputs in small.
-pub(super) struct TrainingWindows {
-    windows: Vec<Window>,
-    shape: WindowShape,
-    width: usize,
-    /// Window by window, frame by frame.
-    small: Vec<f32>,
+/// The windows that the baseline is made of.
+pub(super) struct WindowSets<'a> {
+    pub(super) training: &'a [Window],
+    pub(super) validation: &'a [Window],
+    pub(super) shape: WindowShape,
+    /// Training windows that are searched at most.
+    pub(super) searched: usize,
 }
 
-impl TrainingWindows {
-    /// None if there are no windows. Errors: those of [`Dataset::pixels`].
-    pub(super) fn new(
-        dataset: &Dataset,
-        windows: &[Window],
-        shape: WindowShape,
-    ) -> Result<Option<Self>, EvaluationError> {
-        if windows.is_empty() {
+/// The baseline with its training windows.
+pub(super) struct NearestWindows {
+    windows: TrainingWindows,
+    summary: NearestSummary,
+}
+
+impl NearestWindows {
+    /// Keeps at most `searched` training windows, evenly spread, and chooses the weights by the MSE on validation windows.
+    /// None if there are no training windows. Errors: those of [`Dataset::pixels`].
+    pub(super) fn fit(dataset: &Dataset, sets: &WindowSets) -> Result<Option<Self>, EvaluationError> {
+        let kept = evenly(sets.training, sets.searched);
+        let Some(windows) = TrainingWindows::new(dataset, kept, sets.shape)? else {
             return Ok(None);
-        }
-        let width = dataset.info().frame_width_px as usize;
-        let window_values = shape.context * SMALL_SIDE * SMALL_SIDE;
-        let mut small = vec![0.0; windows.len() * window_values];
-        let places = small.par_chunks_exact_mut(window_values).zip(windows);
-        places.try_for_each(|(small, window)| {
-            let frames = small.chunks_exact_mut(SMALL_SIDE * SMALL_SIDE);
-            for (small, frame) in frames.zip(window.first_frame..) {
-                small.copy_from_slice(&shrunk(&true_frame(dataset, frame)?, width));
+        };
+        let validation = evenly(sets.validation, MAX_VALIDATION_WINDOWS);
+        let mut summary = NearestSummary {
+            searched: windows.len(),
+            available: sets.training.len(),
+            validation_windows: validation.len(),
+            exponent: 1.0,
+            action_weight: 0.0,
+        };
+        let mut least = f64::INFINITY;
+        let weights = if windows.has_actions() {
+            &ACTION_WEIGHTS[..]
+        } else {
+            &[0.0]
+        };
+        for &action_weight in weights {
+            let errors = validation_errors(dataset, &windows, &validation, action_weight)?;
+            for (exponent, error) in EXPONENTS.into_iter().zip(errors) {
+                // Without a validation window no error is known.
+                if error < least && !validation.is_empty() {
+                    least = error;
+                    (summary.exponent, summary.action_weight) = (exponent, action_weight);
+                }
             }
-            Ok::<(), EvaluationError>(())
-        })?;
-        Ok(Some(Self {
-            windows: windows.to_vec(),
-            shape,
-            width,
-            small,
-        }))
+        }
+        Ok(Some(Self { windows, summary }))
     }
 
-    /// The future of the nearest window.
+    /// What was searched and chosen.
+    pub(super) fn summary(&self) -> NearestSummary {
+        self.summary
+    }
+
+    /// The weighted mean of the neighbours' futures. Errors: those of [`Dataset::pixels`].
     pub(super) fn predict(
         &self,
         dataset: &Dataset,
-        inputs: &[Vec<f32>],
+        input: &BaselineInput,
         horizon: usize,
     ) -> Result<Vec<Vec<f32>>, EvaluationError> {
-        let future = self.nearest(dataset, inputs)?.first_frame + self.shape.context..;
-        let frames = future.take(horizon).map(|frame| Ok(true_frame(dataset, frame)?));
-        frames.collect()
-    }
-
-    /// The window with the least squared error. Means of blocks never differ by more than their pixels do, so the windows
-    /// that are close in small are compared first, until no other can be nearer.
-    fn nearest(&self, dataset: &Dataset, inputs: &[Vec<f32>]) -> Result<Window, EvaluationError> {
-        let wanted: Vec<f32> = inputs.iter().flat_map(|frame| shrunk(frame, self.width)).collect();
-        let known = self.small.chunks_exact(wanted.len()).zip(&self.windows);
-        let mut ranked: Vec<(f32, Window)> = known
-            .map(|(small, &window)| (squared_distance(small, &wanted), window))
-            .collect();
-        let candidates = MAX_CANDIDATES.min(ranked.len());
-        ranked.select_nth_unstable_by(candidates - 1, |one, other| one.0.total_cmp(&other.0));
-        ranked.truncate(candidates);
-        ranked.sort_by(|one, other| one.0.total_cmp(&other.0));
-        let bytes = |frame: &Vec<f32>| frame.iter().map(|value| (value * 255.0).round() as u8).collect();
-        let pixels: Vec<Vec<u8>> = inputs.iter().map(bytes).collect();
-        let block_pixels = inputs.first().map_or(0, Vec::len) as f32 / (SMALL_SIDE * SMALL_SIDE) as f32;
-        let mut best = (u64::MAX, ranked[0].1);
-        for (in_small, window) in ranked {
-            let bound = f64::from(in_small * block_pixels) * 255.0 * 255.0;
-            // A little room for rounding, and for blocks of unequal size.
-            if 0.9 * bound > best.0 as f64 {
-                break;
-            }
-            let mut error = 0;
-            for (step, frame) in pixels.iter().enumerate() {
-                error += squared_byte_distance(frame, &dataset.pixels(window.first_frame + step)?);
-            }
-            if error < best.0 {
-                best = (error, window);
-            }
-        }
-        Ok(best.1)
+        let neighbours = self.windows.nearest(dataset, input, self.summary.action_weight)?;
+        let weights = weights(&neighbours, self.summary.exponent);
+        let first = input.inputs.len();
+        let steps = (first..first + horizon).map(|step| Ok(mean(&frames_at(dataset, &neighbours, step)?, &weights)));
+        steps.collect()
     }
 }
 
-/// The means of a frame's blocks, [`SMALL_SIDE`] a side.
-fn shrunk(frame: &[f32], width: usize) -> Vec<f32> {
-    // A side shorter than that has blocks of one pixel, some of them the same.
-    let block = |index: usize, side: usize| {
-        let start = index * side / SMALL_SIDE;
-        start..((index + 1) * side / SMALL_SIDE).max(start + 1)
+/// The sum of the MSE over validation windows and steps for each of [`EXPONENTS`]. Errors: those of [`Dataset::pixels`].
+fn validation_errors(
+    dataset: &Dataset,
+    windows: &TrainingWindows,
+    validation: &[Window],
+    action_weight: f64,
+) -> Result<Vec<f64>, EvaluationError> {
+    let shape = windows.shape();
+    let errors_of = |&window: &Window| -> Result<Vec<f64>, EvaluationError> {
+        let inputs = (0..shape.context).map(|step| true_frame(dataset, window.first_frame + step));
+        let inputs = inputs.collect::<Result<Vec<_>, _>>()?;
+        let input = BaselineInput::of_window(dataset, window, shape, &inputs);
+        let neighbours = windows.nearest(dataset, &input, action_weight)?;
+        let mut errors = vec![0.0; EXPONENTS.len()];
+        for step in shape.context..shape.frames() {
+            let (frames, truth) = (
+                frames_at(dataset, &neighbours, step)?,
+                true_frame(dataset, window.first_frame + step)?,
+            );
+            for (error, exponent) in errors.iter_mut().zip(EXPONENTS) {
+                *error += mse(&mean(&frames, &weights(&neighbours, exponent)), &truth);
+            }
+        }
+        Ok(errors)
     };
-    let mut small = Vec::with_capacity(SMALL_SIDE * SMALL_SIDE);
-    for row in 0..SMALL_SIDE {
-        for column in 0..SMALL_SIDE {
-            let (rows, columns) = (block(row, frame.len() / width), block(column, width));
-            let count = (rows.len() * columns.len()) as f32;
-            let sum: f32 = rows.flat_map(|y| &frame[y * width..][columns.clone()]).sum();
-            small.push(sum / count);
+    let by_window = validation.par_iter().map(errors_of).collect::<Result<Vec<_>, _>>()?;
+    // Added in one order, so that the same weights are chosen in every run.
+    let mut sums = vec![0.0; EXPONENTS.len()];
+    for errors in by_window {
+        for (sum, error) in sums.iter_mut().zip(errors) {
+            *sum += error;
         }
     }
-    small
+    Ok(sums)
 }
 
-/// Summed in lanes, so that it can be done in vectors.
-fn squared_distance(one: &[f32], other: &[f32]) -> f32 {
-    let mut lanes = [0.0f32; 16];
-    for (one, other) in one.chunks(16).zip(other.chunks(16)) {
-        for ((lane, a), b) in lanes.iter_mut().zip(one).zip(other) {
-            *lane += (a - b) * (a - b);
+/// The neighbours' frames at a step of their windows. Errors: those of [`Dataset::pixels`].
+fn frames_at(dataset: &Dataset, neighbours: &[Neighbour], step: usize) -> Result<Vec<Vec<f32>>, EvaluationError> {
+    let frames = neighbours
+        .iter()
+        .map(|near| Ok(true_frame(dataset, near.window.first_frame + step)?));
+    frames.collect()
+}
+
+/// 1 / distance to the power of the exponent, so that the weights add up to 1. A distance is at least 1, the square of one gray
+/// level in one pixel.
+fn weights(neighbours: &[Neighbour], exponent: f64) -> Vec<f32> {
+    let least = neighbours.first().map_or(1.0, |nearest| nearest.distance.max(1.0));
+    let relative = neighbours
+        .iter()
+        .map(|near| (least / near.distance.max(1.0)).powf(exponent));
+    let relative: Vec<f64> = relative.collect();
+    let sum: f64 = relative.iter().sum();
+    relative.into_iter().map(|weight| (weight / sum) as f32).collect()
+}
+
+/// The weighted mean of frames.
+fn mean(frames: &[Vec<f32>], weights: &[f32]) -> Vec<f32> {
+    let mut sum = vec![0.0; frames.first().map_or(0, Vec::len)];
+    for (frame, weight) in frames.iter().zip(weights) {
+        for (sum, value) in sum.iter_mut().zip(frame) {
+            *sum += weight * value;
         }
     }
-    lanes.iter().sum()
-}
-
-fn squared_byte_distance(one: &[u8], other: &[u8]) -> u64 {
-    let squares = one.iter().zip(other).map(|(a, b)| u64::from(a.abs_diff(*b)).pow(2));
-    squares.sum()
+    sum
 }
 
 #[cfg(test)]
 mod tests {
-    use super::*;
+    use rand::Rng;
 
-    #[test]
-    fn a_block_is_the_mean_of_its_pixels() {
-        let frame: Vec<f32> = (0..16 * 16).map(|i| (i % 16 / 2) as f32).collect();
-        let small = shrunk(&frame, 16);
-        assert_eq!(small[..8], [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0]);
-        assert_eq!(shrunk(&[3.0], 1), [3.0; 64]);
+    use super::*;
+    use crate::evaluation::baselines::input::BaselineInput;
+    use foreframe_core::types::{Channel, Seed};
+    use foreframe_data::dataset::{DatasetInfo, EpisodeData};
+
+    const SHAPE: WindowShape = WindowShape { context: 2, horizon: 1 };
+    const SIDE: usize = 12;
+
+    /// One recording of one-channel frames and actions, and all its windows.
+    fn recording(frames: &[Vec<u8>], actions: &[f32]) -> (Dataset, Vec<Window>) {
+        let episode = EpisodeData {
+            timestamps_s: (0..frames.len()).map(|time| time as f64 * 0.2).collect(),
+            pixels: frames.concat(),
+            actions: actions.to_vec(),
+            ..EpisodeData::default()
+        };
+        let info = DatasetInfo {
+            name: "made-up".to_owned(),
+            frame_width_px: SIDE as u32,
+            frame_height_px: SIDE as u32,
+            frame_period_s: 0.2,
+            action_channels: vec![Channel::new("pan", "px")],
+            ..DatasetInfo::default()
+        };
+        let windows = (0..=frames.len() - SHAPE.frames()).map(|first_frame| Window {
+            episode: 0,
+            first_frame,
+        });
+        let windows = windows.collect();
+        (Dataset::from_episodes(info, vec![episode]).unwrap(), windows)
+    }
+
+    /// Frames that differ little as wholes and much in their pixels, so that small images say little.
+    fn noise(count: usize) -> Vec<Vec<u8>> {
+        let mut rng = Seed(3).rng();
+        let frame = |_| (0..SIDE * SIDE).map(|_| rng.random()).collect();
+        (0..count).map(frame).collect()
+    }
+
+    fn inputs(dataset: &Dataset, window: Window) -> Vec<Vec<f32>> {
+        let frames = (0..SHAPE.context).map(|step| true_frame(dataset, window.first_frame + step).unwrap());
+        frames.collect()
+    }
+
+    /// The squared distance between the pixels of two windows' inputs.
+    fn distance(dataset: &Dataset, one: Window, other: Window) -> f64 {
+        let frames = (0..SHAPE.context).map(|step| {
+            let [one, other] = [one, other].map(|window| dataset.pixels(window.first_frame + step).unwrap());
+            let squares = one.iter().zip(&*other).map(|(a, b)| f64::from(a.abs_diff(*b)).powi(2));
+            squares.sum::<f64>()
+        });
+        frames.sum()
     }
 
     #[test]
-    fn distances_are_sums_of_squares() {
-        let one: Vec<f32> = (0..37).map(|i| i as f32).collect();
-        assert_eq!(
-            squared_distance(&one, &[0.0; 37]),
-            (0..37).map(|i| (i * i) as f32).sum::<f32>()
-        );
-        assert_eq!(squared_byte_distance(&[0, 255, 3], &[255, 0, 1]), 2 * 255 * 255 + 4);
+    fn the_neighbours_are_exactly_those_of_a_full_search() {
+        let frames = noise(400);
+        let (dataset, windows) = recording(&frames, &vec![0.0; frames.len()]);
+        let (training, others) = windows.split_at(300);
+        let search = TrainingWindows::new(&dataset, training.to_vec(), SHAPE)
+            .unwrap()
+            .unwrap();
+        for &window in others.iter().step_by(9) {
+            let inputs = inputs(&dataset, window);
+            let input = BaselineInput::of_window(&dataset, window, SHAPE, &inputs);
+            let found = search.nearest(&dataset, &input, 0.0).unwrap();
+            let mut expected: Vec<Neighbour> = training
+                .iter()
+                .map(|&near| Neighbour {
+                    window: near,
+                    distance: distance(&dataset, near, window),
+                })
+                .collect();
+            expected.sort_by(|one, other| one.distance.total_cmp(&other.distance));
+            assert_eq!(found, expected[..8]);
+        }
+    }
+
+    #[test]
+    fn windows_that_are_far_apart_have_their_own_images() {
+        let frames = noise(60);
+        let (dataset, windows) = recording(&frames, &[0.0; 60]);
+        let spread: Vec<Window> = windows.into_iter().step_by(5).collect();
+        let search = TrainingWindows::new(&dataset, spread.clone(), SHAPE).unwrap().unwrap();
+        for window in spread {
+            let inputs = inputs(&dataset, window);
+            let input = BaselineInput::of_window(&dataset, window, SHAPE, &inputs);
+            let found = search.nearest(&dataset, &input, 0.0).unwrap();
+            assert_eq!((found[0].window, found[0].distance), (window, 0.0));
+        }
+    }
+
+    #[test]
+    fn weights_go_from_the_mean_to_the_nearest_alone() {
+        let window = Window {
+            episode: 0,
+            first_frame: 0,
+        };
+        let neighbours = [100.0, 200.0].map(|distance| Neighbour { window, distance });
+        assert_eq!(weights(&neighbours, 0.0), [0.5, 0.5]);
+        assert_eq!(weights(&neighbours, 1.0), [2.0 / 3.0, 1.0 / 3.0]);
+        assert!(weights(&neighbours, 32.0)[0] > 0.999);
+    }
+
+    fn fitted(dataset: &Dataset, windows: &[Window]) -> NearestWindows {
+        let half = windows.len() / 2;
+        let sets = WindowSets {
+            training: &windows[..half],
+            validation: &windows[half + SHAPE.frames()..],
+            shape: SHAPE,
+            searched: usize::MAX,
+        };
+        NearestWindows::fit(dataset, &sets).unwrap().unwrap()
+    }
+
+    #[test]
+    fn near_windows_weigh_more_where_everything_repeats() {
+        let frames: Vec<Vec<u8>> = noise(40).into_iter().cycle().take(160).collect();
+        let (dataset, windows) = recording(&frames, &[0.0; 160]);
+        // Two copies of each window are in the training half, and many that are alike only by chance.
+        assert!(fitted(&dataset, &windows).summary().exponent >= 0.5);
+        let (dataset, windows) = recording(&noise(160), &[0.0; 160]);
+        assert_eq!(fitted(&dataset, &windows).summary().exponent, 0.0, "nothing is near");
+    }
+
+    #[test]
+    fn actions_count_where_the_future_follows_from_them() {
+        let mut rng = Seed(8).rng();
+        let actions: Vec<f32> = (0..300).map(|_| rng.random()).collect();
+        // A frame is as bright as the action before it says; its noise says nothing.
+        let frame = |time: usize| -> Vec<u8> {
+            let level = if time == 0 { 0.0 } else { actions[time - 1] };
+            (0..SIDE * SIDE)
+                .map(|_| (level * 200.0) as u8 + rng.random_range(0..50))
+                .collect()
+        };
+        let frames: Vec<Vec<u8>> = (0..300).map(frame).collect();
+        let (dataset, windows) = recording(&frames, &actions);
+        let summary = fitted(&dataset, &windows).summary();
+        assert!(summary.action_weight >= 0.1, "{summary:?}");
+        let (dataset, windows) = recording(&frames, &[0.5; 300]);
+        assert_eq!(fitted(&dataset, &windows).summary().action_weight, 0.0);
     }
 }

@@ -136,8 +136,10 @@ fn color(method: Method) -> RGBColor {
         Method::LinearExtrapolation => RGBColor(230, 159, 0),
         Method::ConstantShift => RGBColor(86, 180, 233),
         Method::EgoMotion => RGBColor(0, 0, 0),
+        Method::GroundAndWall => RGBColor(120, 160, 60),
+        Method::PlaneSweep => RGBColor(150, 60, 150),
         Method::MovingCutOut => RGBColor(190, 170, 0),
-        Method::NearestWindow => RGBColor(130, 80, 40),
+        Method::NearestWindows => RGBColor(130, 80, 40),
         Method::Black => RGBColor(60, 60, 160),
         Method::CodecOnly => RGBColor(110, 110, 110),
     }
