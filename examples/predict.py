@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Predicts the frames that follow those in a directory, in NumPy alone: the whole forward pass of both networks.
+"""Predicts the frames that follow those in a directory, in NumPy alone: the whole forward pass of the networks.
 
 Usage: predict.py --model models/moving --frames examples/frames --actions examples/frames/actions.json --at 4 --out predicted
 
@@ -362,7 +362,10 @@ class FlowNetwork:
         inputs.append(self.scene(state, nothing, pose)[..., 8:])
         columns, rows = np.meshgrid(centred(self.half[1]), centred(self.half[0]))
         x = np.concatenate(inputs + [columns[..., None], rows[..., None]], 2).astype(np.float32)
-        x = conv3(silu(conv3(x, self.tensors, "flow.stem")), self.tensors, "flow.halving", stride=2)
+        return self.encoded(silu(conv3(x, self.tensors, "flow.stem")))
+
+    def encoded(self, first):
+        x = conv3(first, self.tensors, "flow.halving", stride=2)
         for block in range(self.spec["flow"]["encoder_blocks"]):
             name = f"flow.encoder.{block}"
             inner = conv3(silu(x), self.tensors, name + ".first", dilation=1 << (block % 3))
@@ -388,7 +391,7 @@ class FlowNetwork:
             inputs = np.concatenate([z, unshuffle(scene[..., :8]), seen], 2).astype(np.float32)
             z = z + dense(inputs, self.tensors, "flow.advance")
             z = self.refined(z, self.modulation(step, nothing, None, state))
-            last = self.drawn(z, last, scene, own, own)
+            last = np.clip(self.drawn(z, last, scene, shuffle(scene[..., 8:])[..., 0], own, own), 0, 1)
             predicted.append(last)
         return predicted
 
@@ -421,7 +424,8 @@ class FlowNetwork:
         scene = self.scene(state, motion, pose)
         modulation = self.modulation(step, motion, actions, state)
         z = dense(np.concatenate([warped, unshuffle(scene[..., :8])], 2).astype(np.float32), self.tensors, "flow.mix")
-        return self.drawn(self.refined(z, modulation), last, scene, room, turned)
+        content = shuffle(scene[..., 8:])[..., 0]
+        return np.clip(self.drawn(self.refined(z, modulation), last, scene, content, room, turned), 0, 1)
 
     def refined(self, z, modulation):
         channels = self.spec["flow"]["channels"]
@@ -434,21 +438,109 @@ class FlowNetwork:
             z = z + inner
         return z
 
-    def drawn(self, z, last, scene, room, turned):
+    def drawn(self, z, last, beside, content, room, turned):
         """The frame of a state: pixels of the last frame, moved in two ways, and content, mixed."""
         enlarged = shuffle(dense(silu(z), self.tensors, "flow.enlarge"))
         inside = (outside(room, self.shape) == 0).astype(np.float32)[..., None]
         moved_pixels = unshuffle(sample(last, room)[..., None])
         share = unshuffle(inside).mean(2, keepdims=True)
-        fine = np.concatenate([enlarged, moved_pixels, share, scene], 2).astype(np.float32)
+        fine = np.concatenate([enlarged, moved_pixels, share, beside], 2).astype(np.float32)
         head = shuffle(conv3(silu(conv3(fine, self.tensors, "flow.fine")), self.tensors, "flow.head"))
-        content = shuffle(scene[..., 8:])[..., 0]
         values = [sample(last, room + 4 * head[..., 0:2]), sample(last, turned + 4 * head[..., 2:4]), content + head[..., 7]]
         lost = lambda places: np.minimum(2 * outside(places, self.shape), 8)
         logits = np.stack([head[..., 4] + 1.5 - lost(room), head[..., 5] - lost(turned), head[..., 6]], 2)
         shares = np.exp(logits - logits.max(2, keepdims=True))
         shares = shares / shares.sum(2, keepdims=True)
-        return np.clip((np.stack(values, 2) * shares).sum(2), 0, 1)
+        return (np.stack(values, 2) * shares).sum(2)
+
+
+class DepthNetwork(FlowNetwork):
+    """The form of the flow network that estimates depth. Frames are counted from the last one's mean in its spread."""
+
+    WALL, FARTHER, USUAL_HEIGHT = 2.2, 1.25, 0.3
+
+    def __init__(self, spec, tensors):
+        super().__init__(spec, tensors)
+        self.camera = self.camera or {"horizontal_fov_rad": 1.05, "tilt_down_rad": 0.2}
+        self.viewer = Viewer(self.camera, self.shape)
+        rays = self.viewer.rays()
+        wall = self.WALL / np.maximum(np.hypot(rays[..., 0], rays[..., 1]), 1e-3)
+        height = self.camera.get("height_m") or self.USUAL_HEIGHT
+        floor = np.where(rays[..., 2] < 0, height / np.maximum(-rays[..., 2], 1e-9), np.inf)
+        self.first_depth = np.minimum(wall, floor)
+        columns, rows = np.meshgrid(centred(self.half[1]), centred(self.half[0]))
+        inverse = unshuffle(1 / self.first_depth[..., None]).mean(2)
+        self.place_values = np.stack([columns, rows, inverse], 2)
+
+    def scaled_state(self, state):
+        """Without the pose, which only says how the camera has moved."""
+        read = [place for place in range(len(self.states)) if place not in (self.pose_channels or [])]
+        return super().scaled_state(state)[read]
+
+    def motion_back(self, states, back):
+        """Where the camera stood at an earlier frame, as seen from the last one: yaw, ahead, left."""
+        if self.pose_channels and len(states) > back:
+            (x, y, heading), (there_x, there_y, there) = (self.pose_in(states[at]) for at in (-1, -1 - back))
+            sin, cos, x, y = np.sin(heading), np.cos(heading), there_x - x, there_y - y
+            return (there - heading + np.pi) % (2 * np.pi) - np.pi, cos * x + sin * y, cos * y - sin * x
+        speeds = self.by_unit(self.states)
+        forward, turn = (0, 0) if None in speeds else (states[-1][place] for place in speeds)
+        time = -self.spec["frame_period_s"] * back
+        return turn * time, forward * time * np.cos(turn * time / 2), forward * time * np.sin(turn * time / 2)
+
+    def moved_back(self, last, earlier, motion):
+        """An earlier frame in the last one's view, and how much each block shifts if everything is farther away."""
+        yaw, ahead, left = motion
+        offset = np.array([ahead, left, 0])
+        seen_at = lambda depth: self.viewer.project(rotated(self.viewer.rays() * depth[..., None] - offset, -yaw))
+        near, far = seen_at(self.first_depth), seen_at(self.FARTHER * self.first_depth)
+        is_inside = (near >= -0.5) & (near <= np.array([self.shape[1], self.shape[0]]) - 0.5)
+        frame = np.where(is_inside.all(2), sample(earlier, near), last)
+        return frame, unshuffle(np.clip((far - near) / 4, -4, 4) / 4).reshape(self.half + (4, 2)).sum(2)
+
+    def predict(self, frames, actions, state):
+        states, actions = state, limited(actions, self.spec["actions"])
+        mean, spread = frames[-1].mean(), max(frames[-1].std(), 0.04)
+        frames = [(frame - mean) / spread for frame in frames]
+        blocks, shifts = [unshuffle(frames[-1][..., None])], []
+        for back in range(1, self.spec["flow"]["frames_read"]):
+            earlier = frames[max(len(frames) - 1 - back, 0)]
+            frame, shift = self.moved_back(frames[-1], earlier, self.motion_back(states, back))
+            blocks.append(unshuffle(frame[..., None]))
+            shifts.append(shift)
+        x = np.concatenate(blocks + shifts + [self.place_values], 2).astype(np.float32)
+        first = silu(conv3(x, self.tensors, "flow.stem"))
+        coarse = self.encoded(first)
+        enlarged = silu(shuffle(dense(silu(coarse), self.tensors, "flow.depth.enlarge")))
+        logarithm = conv3(np.concatenate([enlarged, first], 2), self.tensors, "flow.depth.output")
+        depth = self.first_depth * np.exp(1.5 * np.tanh(shuffle(logarithm)[..., 0]))
+        motions = self.motions(states[-1], actions)
+        drawn = [
+            self.step_with_depth(step, frames[-1], coarse, depth, motions[step], (actions, states[-1]))
+            for step in range(len(motions))
+        ]
+        return [np.clip(frame * spread + mean, 0, 1) for frame in drawn]
+
+    def step_with_depth(self, step, last, coarse, depth, motion, known):
+        """Where the camera saw each pixel before it moved: the depth that is found there corrects the guess."""
+        directions, offset = rotated(self.viewer.rays(), motion[0]), np.array([motion[1], motion[2], 0])
+        turned = self.viewer.project(directions)
+        guess = sample(depth, turned)
+        for _ in range(3):
+            points = offset + guess[..., None] * directions
+            deep = np.maximum(self.viewer.cos * points[..., 0] - self.viewer.sin * points[..., 2], 1e-3)
+            guess = guess * np.clip(sample(depth, self.viewer.project(points)) / deep, 0.5, 2)
+        room = self.viewer.project(offset + guess[..., None] * directions)
+        places = (room.reshape(self.quarter[0], 4, self.quarter[1], 4, 2)[:, 1:3, :, 1:3].mean((1, 3)) - 1.5) / 4
+        x, y = places[..., 0], places[..., 1]
+        near = (x >= -1) & (x <= self.quarter[1]) & (y >= -1) & (y <= self.quarter[0])
+        is_seen = (x >= -0.5) & (x <= self.quarter[1] - 0.5) & (y >= -0.5) & (y <= self.quarter[0] - 0.5)
+        warped = np.where(near[..., None], sample(coarse, places), 0)
+        mixed = np.concatenate([warped, self.place_values[::2, ::2], is_seen[..., None]], 2).astype(np.float32)
+        z = self.refined(dense(mixed, self.tensors, "flow.mix"), self.modulation(step, motion, *known))
+        inverse, far = 1 / np.maximum(guess[::2, ::2], 0.05), np.minimum(outside(room[::2, ::2], self.shape) / 8, 4)
+        beside = np.concatenate([self.place_values, inverse[..., None], far[..., None]], 2)
+        return self.drawn(z, last, beside, np.zeros(self.shape), room, turned)
 
 
 # Files and the comparison.
@@ -462,7 +554,8 @@ def ask(server, model, images, actions, state):
     """A server's prediction of the same frames."""
     request = {"frames": [base64.b64encode(image).decode() for image in images]}
     if actions is not None:
-        request |= {"plan": actions, "state": state}
+        known = "states" if np.ndim(state) == 2 else "state"
+        request |= {"plan": actions, known: state}
     body = json.dumps(request).encode()
     url = f"{server}/v1/models/{model}/predict"
     with urllib.request.urlopen(urllib.request.Request(url, body, {"content-type": "application/json"})) as answer:
@@ -492,7 +585,10 @@ def main():
         recorded = json.loads(arguments.actions.read_text())
         actions, state = recorded["actions"][last : last + horizon], recorded["states"][last]
 
-    if spec.get("architecture", "dense") == "flow":
+    if spec.get("flow", {}).get("depth", False):
+        state = recorded["states"][last + 1 - context : last + 1]
+        predicted = DepthNetwork(spec, tensors).predict(frames, actions, state)
+    elif spec.get("architecture", "dense") == "flow":
         predicted = FlowNetwork(spec, tensors).predict(frames, actions, state)
     else:
         predicted = predict_dense(spec, tensors, frames, actions, state)

@@ -175,7 +175,7 @@ fn input(
     if let Some(path) = &args.actions {
         let file = ActionsFile::read(path)?;
         file.check(path, selected.last, spec)?;
-        (input.state, input.plan) = file.conditioning(selected.last, spec);
+        file.fill_in(&mut input, selected.last, spec);
     } else if spec.action_inputs().is_some() {
         return Err(CliError::Usage(format!(
             "--actions is missing; model {name:?} takes {}",

@@ -95,8 +95,7 @@ impl ServerWithRobot {
             frames: (first..=seq).map(image).collect(),
             actions: vec![Action::try_from(numbered_frame(seq).action.unwrap()).unwrap()],
             state: RobotState::try_from(numbered_frame(seq).state.unwrap()).ok(),
-            plan: None,
-            steps: None,
+            ..PredictionInput::default()
         };
         let expected = serving::predict(&self.model, &[&input]).unwrap().remove(0).frames;
         let found: Vec<&[u8]> = frames.iter().map(|frame| frame.0.as_slice()).collect();

@@ -49,6 +49,7 @@ pub(crate) fn condition(spec: &ModelSpec, batch: usize) -> ConditioningTensors {
     ConditioningTensors {
         actions: Some(values(&[batch, spec.horizon, spec.actions.len()], 1.0)),
         state: Some((values(&[batch, spec.states.len()], 2.0) * 1e-3).unwrap()),
+        ..ConditioningTensors::none()
     }
 }
 

@@ -73,12 +73,21 @@ fn recurrent(conditioning: Conditioning) -> ModelSpec {
     spec
 }
 
+/// The same in the form that estimates depth.
+fn with_depth(conditioning: Conditioning, camera: Option<CameraModel>) -> ModelSpec {
+    let mut spec = small(conditioning, camera);
+    flow(&mut spec).layers.depth = true;
+    spec
+}
+
 fn kinds() -> Vec<ModelSpec> {
     let mut kinds = Vec::new();
     for conditioning in [Conditioning::None, Conditioning::Action, Conditioning::StateAction] {
         kinds.extend([None, Some(CAMERA)].map(|camera| small(conditioning, camera)));
     }
     kinds.extend([recurrent(Conditioning::None), recurrent(Conditioning::State)]);
+    kinds.push(with_depth(Conditioning::Action, None));
+    kinds.push(with_depth(Conditioning::StateAction, Some(CAMERA)));
     kinds
 }
 
@@ -103,10 +112,9 @@ fn every_kind_predicts_frames_and_trains_every_tensor() {
             .unwrap()
             .unwrap();
         let shape = [2, spec.horizon, spec.pixels()];
-        assert_eq!(
-            (predicted.frames.dims(), predicted.scene.dims()),
-            (&shape[..], &shape[..])
-        );
+        assert_eq!(predicted.frames.dims(), shape);
+        let has_scene = !spec.flow().unwrap().layers.depth;
+        assert_eq!(predicted.scene.map(|scene| scene.dims().to_vec()), has_scene.then(|| shape.to_vec()));
         let squares = predicted.frames.sqr().unwrap().sum_all().unwrap();
         let loss = (squares + predicted.motion.sqr().unwrap().sum_all().unwrap()).unwrap();
         let gradients = loss.backward().unwrap();
@@ -146,12 +154,55 @@ fn a_future_does_not_depend_on_those_beside_it() {
             let told = ConditioningTensors {
                 actions: told.actions.as_ref().map(row_of),
                 state: told.state.as_ref().map(row_of),
+                ..ConditioningTensors::none()
             };
             let window = seen.narrow(0, windows[row] as usize, 1).unwrap();
             let alone = model.predict_rollouts(&window, &[0], &told).unwrap();
             assert!(largest_difference(&alone, &row_of(&together)) < 1e-6);
         }
     }
+}
+
+#[test]
+fn depth_is_estimated_from_how_the_camera_moved_not_from_where_it_stands() {
+    let spec = with_depth(Conditioning::StateAction, Some(CAMERA));
+    let parameters = Parameters::initialize(&spec, Seed(2)).unwrap();
+    let depth = parameters.get("flow.depth.output.weight").unwrap();
+    depth.set(&values(depth.dims(), 3.0)).unwrap();
+    let model = Network::detached(spec.clone(), &parameters).unwrap();
+    let actions = Tensor::new(&[[[0.5f32, 0.1], [0.5, 0.1]]], &Device::Cpu).unwrap();
+    // Standing at (x, y), and before that further back by `behind` metres a frame.
+    let predicted = |x: f32, y: f32, behind: f32| {
+        let state = |back: f32| [x - behind * back, y, 1.0, 0.0, 0.0];
+        let told = ConditioningTensors {
+            actions: Some(actions.clone()),
+            state: Some(Tensor::new(&[state(0.0)], &Device::Cpu).unwrap()),
+            past_states: Some(Tensor::new(&[[state(2.0), state(1.0)]], &Device::Cpu).unwrap()),
+            ..ConditioningTensors::none()
+        };
+        model.predict_rollouts(&frames(&spec, 1), &[0], &told).unwrap()
+    };
+    assert!(largest_difference(&predicted(0.0, 0.0, 0.1), &predicted(3.0, -2.0, 0.1)) < 1e-4);
+    assert!(largest_difference(&predicted(0.0, 0.0, 0.1), &predicted(0.0, 0.0, 0.0)) > 1e-4);
+    // States that are not known count as absent.
+    let unknown = ConditioningTensors {
+        actions: Some(actions.clone()),
+        state: Some(Tensor::new(&[[0.0f32, 0.0, 1.0, 0.0, 0.0]], &Device::Cpu).unwrap()),
+        past_states: Some(Tensor::full(f32::NAN, (1, 2, 5), &Device::Cpu).unwrap()),
+        ..ConditioningTensors::none()
+    };
+    let unknown = model.predict_rollouts(&frames(&spec, 1), &[0], &unknown).unwrap();
+    assert!(largest_difference(&unknown, &predicted(0.0, 0.0, 0.0)) < 1e-6);
+}
+
+#[test]
+fn a_darker_picture_gives_as_much_darker_a_prediction() {
+    let spec = with_depth(Conditioning::StateAction, Some(CAMERA));
+    let model = Network::detached(spec.clone(), &Parameters::initialize(&spec, Seed(2)).unwrap()).unwrap();
+    let (seen, told) = (frames(&spec, 1), condition(&spec, 1));
+    let darker = (&seen * 0.7).unwrap();
+    let of = |seen: &Tensor| model.predict_rollouts(seen, &[0], &told).unwrap();
+    assert!(largest_difference(&of(&darker), &(of(&seen) * 0.7).unwrap()) < 1e-5);
 }
 
 #[test]

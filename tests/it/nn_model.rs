@@ -121,6 +121,7 @@ fn a_batched_window_is_predicted_as_a_single_one() {
         let own = ConditioningTensors {
             actions: condition.actions.as_ref().map(one),
             state: condition.state.as_ref().map(one),
+            ..ConditioningTensors::none()
         };
         let alone = model.predict_frames(&one(&frames), &own).unwrap();
         assert!(largest_difference(&alone, &one(&together)) < 1e-5);
@@ -149,6 +150,7 @@ fn an_action_changes_only_later_frames() {
         let condition = ConditioningTensors {
             actions: Some(actions),
             state: None,
+            ..ConditioningTensors::none()
         };
         model.predict_frames(&frames, &condition).unwrap()
     };

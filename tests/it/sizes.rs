@@ -113,6 +113,7 @@ fn no_accepted_value_makes_a_prediction_nan() {
                     .action_inputs()
                     .map(|count| filled(value, &[1, spec.horizon, count])),
                 state: spec.state_inputs().map(|count| filled(value, &[1, count])),
+                ..ConditioningTensors::none()
             };
             let predicted = model.predict_frames(&frames, &conditioning).unwrap();
             let predicted: Vec<f32> = predicted.flatten_all().unwrap().to_vec1().unwrap();

@@ -81,8 +81,7 @@ impl Recording {
             frames: self.frames[seq + 1 - model.manifest.spec.context..=seq].to_vec(),
             actions: Action::try_from(self.actions[seq].clone()).into_iter().collect(),
             state: RobotState::try_from(self.states[seq].clone()).ok(),
-            plan: None,
-            steps: None,
+            ..PredictionInput::default()
         };
         serving::predict(model, &[&input]).unwrap().remove(0).frames
     }
@@ -162,6 +161,7 @@ fn batched_predictions_equal_single_ones_within_1e_5() {
         let condition = foreframe_core::nn::ConditioningTensors {
             actions: Some(tensor(&[64, spec.horizon, spec.actions.len().max(1)])),
             state: Some(tensor(&[64, spec.states.len().max(1)])),
+            ..foreframe_core::nn::ConditioningTensors::none()
         };
         let together = model.network.predict_rollouts(&features, &windows, &condition).unwrap();
         for (future, &window) in windows.iter().enumerate() {
@@ -169,6 +169,7 @@ fn batched_predictions_equal_single_ones_within_1e_5() {
             let condition = foreframe_core::nn::ConditioningTensors {
                 actions: row(&condition.actions),
                 state: row(&condition.state),
+                ..foreframe_core::nn::ConditioningTensors::none()
             };
             let window = features.narrow(0, window as usize, 1).unwrap();
             let alone = model

@@ -83,6 +83,22 @@ pub fn test_flow_model() -> Model {
     })
 }
 
+/// As [`test_flow_model`], in the form that estimates depth, with a pose.
+#[cfg(test)]
+pub fn test_depth_model() -> Model {
+    use crate::nn::{Architecture, ChannelScale, ModelSpec};
+    let mut spec: ModelSpec = test_flow_model().network.spec().clone();
+    if let Architecture::Flow(flow) = &mut spec.architecture {
+        flow.layers.depth = true;
+    }
+    let channel = |name: &str| ChannelScale {
+        name: name.to_owned(),
+        ..spec.states[0].clone()
+    };
+    spec.states = ["x", "y", "heading_cos", "heading_sin"].map(channel).to_vec();
+    loaded(spec)
+}
+
 /// A model of that specification with fresh weights.
 #[cfg(test)]
 fn loaded(spec: crate::nn::ModelSpec) -> Model {

@@ -58,8 +58,13 @@ fn network(spec: &ModelSpec) -> String {
         Architecture::Flow(flow) => {
             let layers = &flow.layers;
             let camera = if flow.camera.is_some() { "known" } else { "unknown" };
+            let form = match (layers.depth, layers.recurrent) {
+                (true, _) => "flow with depth",
+                (false, true) => "recurrent flow",
+                (false, false) => "flow",
+            };
             format!(
-                "flow: {} channels, {} encoder and {} decoder blocks; conditioning {conditioning}, camera {camera}, {inverted}",
+                "{form}: {} channels, {} encoder and {} decoder blocks; conditioning {conditioning}, camera {camera}, {inverted}",
                 layers.channels, layers.encoder_blocks, layers.decoder_blocks
             )
         }

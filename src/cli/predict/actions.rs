@@ -6,6 +6,7 @@ use serde::Deserialize;
 
 use crate::cli::error::CliError;
 use foreframe_core::nn::ModelSpec;
+use foreframe_core::serving::PredictionInput;
 use foreframe_core::types::{Action, RobotState};
 
 /// One entry for each image of the directory.
@@ -57,10 +58,16 @@ impl ActionsFile {
         )))
     }
 
-    /// The state at frame `last` and the actions from it on, as far as the model takes them.
-    pub(super) fn conditioning(self, last: usize, spec: &ModelSpec) -> (Option<RobotState>, Option<Vec<Action>>) {
-        let state = self.states.into_iter().nth(last);
+    /// Fills in the states at the context's frames, of which `last` is the last one, and the actions from it on, as far as the
+    /// model takes them.
+    pub(super) fn fill_in(mut self, input: &mut PredictionInput, last: usize, spec: &ModelSpec) {
+        self.states.truncate(last + 1);
+        input.state = if self.states.len() > last { self.states.pop() } else { None };
+        if spec.reads_past_states() {
+            let spare = self.states.len().saturating_sub(spec.context - 1);
+            input.past_states = self.states.split_off(spare);
+        }
         let future = self.actions.into_iter().skip(last).take(spec.horizon);
-        (state, spec.action_inputs().map(|_| future.collect()))
+        input.plan = spec.action_inputs().map(|_| future.collect());
     }
 }

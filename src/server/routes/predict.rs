@@ -148,8 +148,10 @@ impl PredictRequest {
         self.units.as_ref().map_or(Ok(()), |units| units.check(manifest))?;
         let frames = decode_frames(self.frames, ImageInput { format, resize }, manifest, config.max_frames)?;
         let seen = picture::context_for(wanted, &frames);
+        let (past_states, state) = states(self.state, self.states, frames.len())?;
         let input = PredictionInput {
-            state: last_state(self.state, self.states, frames.len())?,
+            state,
+            past_states,
             actions: actions("actions", self.actions)?,
             plan: self.plan.map(|values| actions("plan", values)).transpose()?,
             steps: self.steps,
@@ -216,13 +218,13 @@ pub(super) fn decode_frames(
     Ok(frames?)
 }
 
-/// The state at the last frame, from `state` or `states` of a request.
-pub(super) fn last_state(
+/// The states at the earlier frames, if they are given, and that at the last one, from `state` or `states` of a request.
+pub(super) fn states(
     state: Option<Vec<f32>>,
     states: Option<Vec<Vec<f32>>>,
     frames: usize,
-) -> Result<Option<RobotState>, ApiError> {
-    let given = match (state, states) {
+) -> Result<(Vec<RobotState>, Option<RobotState>), ApiError> {
+    let (past, last) = match (state, states) {
         (_, Some(states)) if states.len() != frames => {
             return Err(ApiError::Unprocessable(format!(
                 "states holds {} states; there are {frames} frames, and each has one",
@@ -234,9 +236,15 @@ pub(super) fn last_state(
                 "state and states are both given; give one".to_owned(),
             ));
         }
-        (state, states) => state.or_else(|| states?.pop()),
+        (None, Some(mut states)) => {
+            let last = states.pop();
+            (states, last)
+        }
+        (state, None) => (Vec::new(), state),
     };
-    given.map(RobotState::try_from).transpose().map_err(unfit("state"))
+    let state = |values| RobotState::try_from(values).map_err(unfit("state"));
+    let past = past.into_iter().map(state).collect::<Result<_, _>>()?;
+    Ok((past, last.map(state).transpose()?))
 }
 
 /// The actions in `field` of a request.

@@ -87,6 +87,7 @@ fn simulate(manifest: &Manifest) -> Result<(PredictionInput, Vec<Frame>), SimErr
         frames: frames[LEAD_IN_FRAMES..=now].to_vec(),
         actions: Vec::new(),
         state: Some(states[now].clone()),
+        past_states: states[LEAD_IN_FRAMES..now].to_vec(),
         plan: Some(actions[now..now + horizon].to_vec()),
         steps: None,
     };

@@ -160,15 +160,16 @@ async fn session_rollouts(
             "the session has {have} of the {need} frames that a prediction takes; send more frames"
         )));
     }
-    let given = predict::last_state(request.state, None, 0)?;
+    let (_, given) = predict::states(request.state, None, 0)?;
     let robot_state = given.or_else(|| state.robot_state().cloned());
-    let task = state.rollout_task(conditioning(
+    let inputs = conditioning(
         request.plans,
         request.steps,
         robot_state,
         &model.manifest,
         app.config(),
-    )?);
+    )?;
+    let task = state.rollout_task(inputs, model.spec());
     let prediction = app.predictor().compute(&model, task, Some(session.key)).await?;
     let encode = move || answer(wanted, format, &[], prediction);
     picture::threads_for(&app, wanted).run(encode).await?
@@ -184,10 +185,10 @@ impl RolloutRequest {
     ) -> Result<(Vec<Frame>, Task), ApiError> {
         let (format, resize) = (self.format, self.resize);
         let frames = predict::decode_frames(self.frames, ImageInput { format, resize }, manifest, config.max_frames)?;
-        let state = predict::last_state(self.state, self.states, frames.len())?;
+        let (past_states, state) = predict::states(self.state, self.states, frames.len())?;
         let conditioning = conditioning(self.plans, self.steps, state, manifest, config)?;
         let seen = picture::context_for(wanted, &frames);
-        let task = Task::rollout(frames, conditioning, manifest)?;
+        let task = Task::rollout(frames, past_states, conditioning, manifest)?;
         Ok((seen, task))
     }
 }

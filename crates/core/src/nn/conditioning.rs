@@ -26,8 +26,8 @@ pub struct ConditioningTensors {
     pub actions: Option<Tensor>,
     /// State at the last context frame `[B, S]`.
     pub state: Option<Tensor>,
-    /// States at the context's earlier frames `[B, context - 1, S]`, for networks that estimate depth. Without them, the
-    /// camera counts as having moved as fast as at the last frame.
+    /// States at the context's earlier frames `[B, context - 1, S]`, for networks that estimate depth. Without them, or where
+    /// they are NaN, the camera counts as having moved as fast as at the last frame.
     pub past_states: Option<Tensor>,
     /// The camera of each window, B of them, for networks that estimate depth. Without them, the model's.
     pub cameras: Vec<CameraModel>,

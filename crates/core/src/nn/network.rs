@@ -262,6 +262,7 @@ mod tests {
         let conditioning = ConditioningTensors {
             actions: Some(Tensor::from_vec(actions, (1, steps, 2), &Device::Cpu).unwrap()),
             state: Some(Tensor::new(&[[1.0f32, 2.0, 0.8, 0.6]], &Device::Cpu).unwrap()),
+            ..ConditioningTensors::none()
         };
         model.predict_steps(&codes, &[0], &conditioning, steps).unwrap()
     }

@@ -52,11 +52,13 @@ type RolloutRow<'a> = (u32, &'a ConditioningInput);
 fn compute(loaded: &Model, tasks: &[&Task]) -> Result<Vec<Prediction>, Failure> {
     let mut encoded = encode(loaded, tasks)?.into_iter();
     let (mut predictions, mut windows, mut rows) = (Vec::new(), Vec::new(), Vec::<RolloutRow>::new());
+    let mut past_states: Vec<&[RobotState]> = Vec::new();
     for task in tasks {
         let features: Vec<Features> = encoded.by_ref().take(task.frames.len()).collect();
         if !task.conditioning_inputs.is_empty() {
             let window = windows.len() as u32;
             rows.extend(task.conditioning_inputs.iter().map(|input| (window, input)));
+            past_states.push(&task.past_states);
             windows.push(task.past_features.iter().chain(&features).cloned().collect());
         }
         predictions.push(Prediction {
@@ -70,7 +72,7 @@ fn compute(loaded: &Model, tasks: &[&Task]) -> Result<Vec<Prediction>, Failure> 
     if rows.is_empty() {
         return Ok(predictions);
     }
-    let mut rollouts = Windows::new(loaded, &windows)?.predict(&rows)?.into_iter();
+    let mut rollouts = Windows::new(loaded, &windows, past_states)?.predict(&rows)?.into_iter();
     for (task, prediction) in tasks.iter().zip(&mut predictions) {
         prediction.rollouts = rollouts.by_ref().take(task.conditioning_inputs.len()).collect();
     }
@@ -99,11 +101,17 @@ struct Windows<'a> {
     contexts: Vec<ContextStatistics>,
     /// The features of all windows `[windows, context, F]`.
     features: Tensor,
+    /// The states at each window's frames before the last one; empty where they are not known.
+    past_states: Vec<&'a [RobotState]>,
 }
 
 impl<'a> Windows<'a> {
-    /// From the features of each window's frames.
-    fn new(loaded: &'a Model, windows: &[Vec<Features>]) -> Result<Self, Failure> {
+    /// From the features and the earlier states of each window's frames.
+    fn new(
+        loaded: &'a Model,
+        windows: &[Vec<Features>],
+        past_states: Vec<&'a [RobotState]>,
+    ) -> Result<Self, Failure> {
         let spec = loaded.spec();
         let values = windows
             .iter()
@@ -121,6 +129,7 @@ impl<'a> Windows<'a> {
             loaded,
             contexts,
             features: Tensor::from_vec(values, shape, &Device::Cpu)?,
+            past_states,
         })
     }
 
@@ -144,7 +153,10 @@ impl<'a> Windows<'a> {
     fn rollouts(&self, rows: &[RolloutRow<'_>], steps: usize) -> Result<Vec<Rollout>, Failure> {
         let spec = self.loaded.spec();
         let (window_of, inputs): (Vec<u32>, Vec<&ConditioningInput>) = rows.iter().copied().unzip();
-        let conditioning = condition(spec, &inputs, steps)?;
+        let conditioning = ConditioningTensors {
+            past_states: self.past_states(&window_of)?,
+            ..condition(spec, &inputs, steps)?
+        };
         let network = &self.loaded.network;
         let codes = network.predict_steps(&self.features, &window_of, &conditioning, steps)?;
         let codes = codes.flatten(0, 1)?;
@@ -158,6 +170,25 @@ impl<'a> Windows<'a> {
                     .collect()
             })
         })??)
+    }
+
+    /// The earlier states of the window of each row `[N, context - 1, S]`, NaN where they are not known; `None` if no
+    /// window's are.
+    fn past_states(&self, window_of: &[u32]) -> Result<Option<Tensor>, Failure> {
+        let spec = self.loaded.spec();
+        let (frames, channels) = (spec.context - 1, spec.states.len());
+        let of_rows = window_of.iter().map(|&window| self.past_states[window as usize]);
+        if of_rows.clone().all(<[RobotState]>::is_empty) {
+            return Ok(None);
+        }
+        let mut values = Vec::with_capacity(window_of.len() * frames * channels);
+        for states in of_rows {
+            match states {
+                [] => values.extend(std::iter::repeat_n(f32::NAN, frames * channels)),
+                _ => values.extend(states.iter().flat_map(RobotState::as_slice)),
+            }
+        }
+        Ok(Some(Tensor::from_vec(values, (window_of.len(), frames, channels), &Device::Cpu)?))
     }
 
     /// A rollout with its expected errors and its novelty. `seen`: the features of all windows.

@@ -150,6 +150,32 @@ fn check_state(manifest: &Manifest, state: Option<RobotState>) -> Result<Option<
     Ok(Some(state))
 }
 
+/// The states at the context's frames before the last one, if the model reads them; empty if they are not known.
+/// Errors: `PastStates`, `Dimension`.
+pub(super) fn past_states_used(states: Vec<RobotState>, manifest: &Manifest) -> Result<Vec<RobotState>, InputError> {
+    let (model, spec) = (&manifest.name, &manifest.spec);
+    if states.is_empty() || !spec.reads_past_states() {
+        return Ok(Vec::new());
+    }
+    if states.len() != spec.context - 1 {
+        return Err(InputError::PastStates {
+            model: model.clone(),
+            found: states.len(),
+            expected: spec.context - 1,
+        });
+    }
+    check_states(states, manifest)
+}
+
+/// Errors: `Dimension` if a state has not all channels.
+pub(super) fn check_states(states: Vec<RobotState>, manifest: &Manifest) -> Result<Vec<RobotState>, InputError> {
+    for (index, state) in states.iter().enumerate() {
+        let field = || format!("states[{index}]");
+        check_length(field, &manifest.name, state.as_slice(), &manifest.spec.states)?;
+    }
+    Ok(states)
+}
+
 fn check_length(
     field: impl Fn() -> String,
     model: &ModelName,

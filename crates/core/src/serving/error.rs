@@ -114,6 +114,16 @@ pub enum InputError {
         /// Frames given.
         frames: usize,
     },
+    /// The number of past states is not the number of frames before the last one.
+    #[error("there are {found} states before the last frame's; model \"{model}\" takes {expected}, one for each frame")]
+    PastStates {
+        /// The model's name.
+        model: ModelName,
+        /// States given.
+        found: usize,
+        /// The model's context without the last frame.
+        expected: usize,
+    },
     /// The number of actions of a plan is not the number of frames to predict.
     #[error("{field} holds {found} actions; model \"{model}\" takes {expected}")]
     PlanLength {

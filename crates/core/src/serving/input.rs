@@ -1,6 +1,6 @@
 //! The input of a prediction, and the check that it fits a model.
 
-use super::conditioning::{ConditioningInput, REQUEST_FIELDS, RawConditioning};
+use super::conditioning::{ConditioningInput, REQUEST_FIELDS, RawConditioning, past_states_used};
 use super::error::InputError;
 use super::ranges::range_warnings;
 use super::task::{Task, check_frames};
@@ -18,6 +18,9 @@ pub struct PredictionInput {
     pub actions: Vec<Action>,
     /// The robot's state at the last frame.
     pub state: Option<RobotState>,
+    /// The states at the frames before it, oldest first: a model that estimates depth reads from them how the camera has moved.
+    /// Empty: it counts as having moved as fast as at the last frame.
+    pub past_states: Vec<RobotState>,
     /// The plan: the first action acts from the last frame to the first predicted one.
     pub plan: Option<Vec<Action>>,
     /// Frames to predict; the model's horizon if absent. More are beyond what the model was trained for.
@@ -33,6 +36,7 @@ impl PredictionInput {
     /// The conditioning input, if the whole input fits the model.
     fn checked(&self, manifest: &Manifest) -> Result<ConditioningInput, InputError> {
         check_frames(&self.frames, manifest)?;
+        past_states_used(self.past_states.clone(), manifest)?;
         if self.actions.len() > self.frames.len() {
             return Err(InputError::ActionCount {
                 found: self.actions.len(),
@@ -65,6 +69,7 @@ impl PredictionInput {
     pub fn into_task(self, manifest: &Manifest) -> Result<Task, InputError> {
         Ok(Task {
             conditioning_inputs: vec![self.checked(manifest)?],
+            past_states: past_states_used(self.past_states, manifest)?,
             frames: self.frames,
             ..Task::default()
         })

@@ -93,7 +93,7 @@ impl Session {
         let steps = plans.first().map(Vec::len);
         let state = self.state.robot_state().cloned();
         let inputs = ConditioningInput::of_plans(plans, state, steps, &self.model.manifest)?;
-        rollouts(&self.model, &[self.state.rollout_task(inputs)])
+        rollouts(&self.model, &[self.state.rollout_task(inputs, self.model.spec())])
     }
 
     /// What of the last state and actions was out of the range that the model saw in training; nothing if its manifest has
@@ -119,7 +119,7 @@ impl Session {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::serving::{test_flow_model, test_model};
+    use crate::serving::{test_depth_model, test_flow_model, test_model};
 
     #[test]
     fn a_session_predicts_the_same_as_a_window() {
@@ -197,8 +197,7 @@ mod tests {
                 frames: seen[start..].to_vec(),
                 actions: vec![action(f32::from(seq))],
                 state: RobotState::try_from(vec![f32::from(seq)]).ok(),
-                plan: None,
-                steps: None,
+                ..PredictionInput::default()
             };
             assert_eq!(computed.rollouts, predict(model, &[&input]).unwrap());
             let repeated = state.repeat_task(spec).unwrap();
@@ -208,6 +207,32 @@ mod tests {
             );
         }
         assert_eq!((state.next_seq(), state.frame_count()), (8, 3));
+    }
+
+    #[test]
+    fn a_session_keeps_how_the_camera_moved() {
+        let model = Arc::new(test_depth_model());
+        let state = |seq: u8| RobotState::try_from(vec![0.1 * f32::from(seq * seq), 0.0, 1.0, 0.0]).unwrap();
+        let plan = vec![action(0.5); 2];
+        let mut session = Session::new(Arc::clone(&model));
+        for seq in 0..6u8 {
+            // Also after the session moved to another program.
+            session = Session::restore(Arc::clone(&model), session.snapshot()).unwrap();
+            let predicted = session.step(frame(seq, 8), Some(&state(seq)), Some(&plan)).unwrap();
+            let Some(start) = seq.checked_sub(2) else { continue };
+            let input = |past_states| PredictionInput {
+                frames: (start..=seq).map(|seq| frame(seq, 8)).collect(),
+                state: Some(state(seq)),
+                past_states,
+                plan: Some(plan.clone()),
+                ..PredictionInput::default()
+            };
+            let known = predict(&model, &[&input(vec![state(start), state(seq - 1)])]).unwrap();
+            let unknown = predict(&model, &[&input(Vec::new())]).unwrap();
+            assert_eq!(predicted.as_ref(), known.first());
+            assert_ne!(known, unknown);
+            assert_eq!(session.rollouts(vec![plan.clone()]).unwrap(), known);
+        }
     }
 
     #[test]

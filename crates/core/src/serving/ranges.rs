@@ -16,7 +16,15 @@ pub(super) fn range_warnings(manifest: &Manifest, inputs: &[ConditioningInput]) 
     let states: Vec<&[f32]> = states.map(RobotState::as_slice).collect();
     let actions: Vec<&[f32]> = actions.map(Action::as_slice).collect();
     let spec = &manifest.spec;
-    let mut warnings = warnings_of("state", &spec.states, &calibration.states, &states);
+    // A pose that only says how the camera has moved may have any origin.
+    let read = spec.states_read_by_layers();
+    let mut warnings = Vec::new();
+    for channel in read {
+        let (channels, ranges) = (spec.states.get(channel..=channel), calibration.states.get(channel..=channel));
+        let (Some(channels), Some(ranges)) = (channels, ranges) else { continue };
+        let values: Vec<&[f32]> = states.iter().filter_map(|state| state.get(channel..=channel)).collect();
+        warnings.extend(warnings_of("state", channels, ranges, &values));
+    }
     warnings.extend(warnings_of("action", &spec.actions, &calibration.actions, &actions));
     warnings
 }

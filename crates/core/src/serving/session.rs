@@ -5,7 +5,7 @@ use std::collections::VecDeque;
 
 use serde::{Deserialize, Serialize};
 
-use super::conditioning::{ConditioningInput, FieldNames, RawConditioning};
+use super::conditioning::{ConditioningInput, FieldNames, RawConditioning, check_states};
 use super::error::InputError;
 use super::task::{Features, Task};
 use crate::frame::Frame;
@@ -53,6 +53,14 @@ pub enum SnapshotError {
         /// Frames given.
         frames: usize,
     },
+    /// More past states than frames before the last one.
+    #[error("snapshot.past_states holds {found} states; snapshot.features holds {frames} frames, and the last one's is in snapshot.state")]
+    StateCount {
+        /// States given.
+        found: usize,
+        /// Frames given.
+        frames: usize,
+    },
     /// The actions or the state do not fit the model.
     #[error("snapshot: {0}")]
     ConditioningInput(#[from] InputError),
@@ -73,6 +81,10 @@ pub struct SessionSnapshot {
     /// The robot's state at the last frame; absent if the model takes none.
     #[cfg_attr(feature = "schema", schema(value_type = Option<Vec<f32>>))]
     pub state: Option<RobotState>,
+    /// The states at the frames before it, oldest first, if the model reads them.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    #[cfg_attr(feature = "schema", schema(value_type = Vec<Vec<f32>>))]
+    pub past_states: Vec<RobotState>,
     /// How many frames the last prediction had; absent: the model's horizon.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub steps: Option<usize>,
@@ -83,6 +95,8 @@ pub struct SessionSnapshot {
 pub struct SessionState {
     next_seq: u64,
     features: VecDeque<Features>,
+    /// The states at the frames before the last one, at most one less than the context; kept if the model reads them.
+    past_states: VecDeque<RobotState>,
     /// The last one.
     pub(super) conditioning: ConditioningInput,
 }
@@ -117,7 +131,18 @@ impl SessionState {
             0 => ConditioningInput::default(),
             _ => ConditioningInput::new(raw, &SNAPSHOT_FIELDS, manifest)?,
         };
+        if snapshot.past_states.len() >= frames.max(1) {
+            return Err(SnapshotError::StateCount {
+                found: snapshot.past_states.len(),
+                frames,
+            });
+        }
+        let past_states = match spec.reads_past_states() {
+            true => check_states(snapshot.past_states, manifest)?,
+            false => Vec::new(),
+        };
         Ok(Self {
+            past_states: past_states.into(),
             next_seq: snapshot.next_seq,
             features: snapshot.features.into_iter().map(Features::from).collect(),
             conditioning,
@@ -132,6 +157,7 @@ impl SessionState {
             features: self.features.iter().map(|features| features.to_vec()).collect(),
             actions: self.conditioning.actions.clone(),
             state: self.conditioning.state.clone(),
+            past_states: self.past_states.iter().cloned().collect(),
             steps: self.conditioning.steps,
         }
     }
@@ -160,8 +186,10 @@ impl SessionState {
         let spare = (self.features.len() + 1).saturating_sub(spec.context);
         let past_features: Vec<Features> = self.features.iter().skip(spare).cloned().collect();
         let is_full = past_features.len() + 1 == spec.context;
+        let past_states = self.past_states.iter().chain(&self.conditioning.state);
         Task {
             past_features,
+            past_states: last_states(past_states.cloned().collect(), spec),
             frames: vec![frame],
             conditioning_inputs: conditioning.filter(|_| is_full).into_iter().collect(),
         }
@@ -173,6 +201,12 @@ impl SessionState {
         while self.features.len() > spec.context {
             self.features.pop_front();
         }
+        if let Some(state) = self.conditioning.state.take().filter(|_| spec.reads_past_states()) {
+            self.past_states.push_back(state);
+        }
+        while self.past_states.len() >= spec.context {
+            self.past_states.pop_front();
+        }
         self.conditioning = conditioning;
         self.next_seq = seq.saturating_add(1);
     }
@@ -180,14 +214,15 @@ impl SessionState {
     /// The task that repeats the last prediction; `None` while the context is not full.
     #[must_use]
     pub fn repeat_task(&self, spec: &ModelSpec) -> Option<Task> {
-        (self.features.len() == spec.context).then(|| self.rollout_task(vec![self.conditioning.clone()]))
+        (self.features.len() == spec.context).then(|| self.rollout_task(vec![self.conditioning.clone()], spec))
     }
 
     /// The task that predicts one rollout for each conditioning input from the last frame. The context must be full.
     #[must_use]
-    pub fn rollout_task(&self, conditioning_inputs: Vec<ConditioningInput>) -> Task {
+    pub fn rollout_task(&self, conditioning_inputs: Vec<ConditioningInput>, spec: &ModelSpec) -> Task {
         Task {
             past_features: self.features.iter().cloned().collect(),
+            past_states: last_states(self.past_states.iter().cloned().collect(), spec),
             frames: Vec::new(),
             conditioning_inputs,
         }
@@ -199,6 +234,14 @@ const SNAPSHOT_FIELDS: FieldNames = FieldNames {
     plan: "actions",
     missing: "actions",
 };
+
+/// The last states, one for each of the context's frames before its last one; none if there are fewer.
+fn last_states(mut states: Vec<RobotState>, spec: &ModelSpec) -> Vec<RobotState> {
+    match states.len().checked_sub(spec.context - 1) {
+        Some(spare) if spec.reads_past_states() => states.split_off(spare),
+        _ => Vec::new(),
+    }
+}
 
 fn check_features(index: usize, features: &[f32], spec: &ModelSpec) -> Result<(), SnapshotError> {
     if features.len() != spec.code_len() {
@@ -244,6 +287,7 @@ mod tests {
                 features,
                 actions: actions.into_iter().map(action).collect(),
                 state: state.and_then(|value| RobotState::try_from(vec![value]).ok()),
+                past_states: Vec::new(),
                 steps: None,
             };
             let is_sound = snapshot.features.len() <= 3
@@ -270,6 +314,7 @@ mod tests {
             features: vec![vec![0.0; 5]],
             actions: vec![action(0.0); 2],
             state: RobotState::try_from(vec![0.0]).ok(),
+            past_states: Vec::new(),
             steps: None,
         };
         snapshot.features[0][3] = f32::NAN;

@@ -2,10 +2,11 @@
 
 use std::sync::Arc;
 
-use super::conditioning::ConditioningInput;
+use super::conditioning::{ConditioningInput, past_states_used};
 use super::error::InputError;
 use crate::frame::Frame;
 use crate::registry::Manifest;
+use crate::types::RobotState;
 
 /// The features of one frame, `[F]`.
 pub type Features = Arc<[f32]>;
@@ -17,19 +18,24 @@ pub struct Task {
     pub(super) past_features: Vec<Features>,
     /// The frames to encode, which follow those.
     pub(super) frames: Vec<Frame>,
+    /// The states at the context's frames before the last one, oldest first; empty where they are not known or not used.
+    pub(super) past_states: Vec<RobotState>,
     /// One for each rollout; empty while the context is not full.
     pub(super) conditioning_inputs: Vec<ConditioningInput>,
 }
 
 impl Task {
-    /// One rollout for each conditioning input from the context in `frames`. Errors: those of the frames.
+    /// One rollout for each conditioning input from the context in `frames`, with the states at its frames before the last
+    /// one, if they are known. Errors: those of the frames and of the states.
     pub fn rollout(
         frames: Vec<Frame>,
+        past_states: Vec<RobotState>,
         conditioning_inputs: Vec<ConditioningInput>,
         manifest: &Manifest,
     ) -> Result<Self, InputError> {
         check_frames(&frames, manifest)?;
         Ok(Self {
+            past_states: past_states_used(past_states, manifest)?,
             frames,
             conditioning_inputs,
             ..Self::default()
@@ -44,6 +50,7 @@ impl Task {
         let later = self.conditioning_inputs.split_off(limit);
         Self {
             past_features: self.past_features.clone(),
+            past_states: self.past_states.clone(),
             frames: std::mem::take(&mut self.frames),
             conditioning_inputs: std::mem::replace(&mut self.conditioning_inputs, later),
         }

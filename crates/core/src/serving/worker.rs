@@ -100,6 +100,7 @@ pub(super) fn blank_input(model: &Model) -> PredictionInput {
         frames: vec![frame; spec.context],
         actions: Action::try_from(vec![0.0; spec.actions.len()]).into_iter().collect(),
         state: RobotState::try_from(vec![0.0; spec.states.len()]).ok(),
+        past_states: Vec::new(),
         plan: None,
         steps: None,
     }

@@ -139,7 +139,7 @@ impl<'a> FrameSource<'a> {
         let (past, future) = (span(0, context), span(context, horizon));
         // An action acts from its frame to the next one, so the action of the last input leads to the first target. Models with
         // windows that are played backwards take no actions.
-        let (acting, last) = (span(context - 1, horizon), span(context - 1, 1));
+        let (acting, last, earlier) = (span(context - 1, horizon), span(context - 1, 1), span(0, context - 1));
         let batched = |frames: Tensor, length: usize| frames.reshape((windows.len(), length, ()));
         let future_inputs = with_future.then(|| inputs(&future)).transpose()?;
         Ok(WindowBatch {
@@ -150,6 +150,8 @@ impl<'a> FrameSource<'a> {
             condition: ConditioningTensors {
                 actions: self.channels(ACTION, &acting, &[windows.len(), horizon])?,
                 state: self.channels(STATE, &last, &[windows.len()])?,
+                past_states: self.channels(STATE, &earlier, &[windows.len(), context - 1])?,
+                cameras: windows.iter().map_while(|drawn| self.dataset.camera(drawn.window.episode)).collect(),
             },
             future_states: self.channels(STATE, &future, &[windows.len(), horizon])?,
         })

@@ -6,12 +6,13 @@ use crate::settings::{LayeredSettings, SettingsLayer};
 use foreframe_core::registry::Manifest;
 
 /// Name and text of each preset.
-const PRESETS: [(&str, &str); 7] = [
+const PRESETS: [(&str, &str); 8] = [
     ("paper", include_str!("presets/paper.toml")),
     ("static", include_str!("presets/static.toml")),
     ("moving", include_str!("presets/moving.toml")),
     ("static-flow", include_str!("presets/static-flow.toml")),
     ("moving-flow", include_str!("presets/moving-flow.toml")),
+    ("rooms", include_str!("presets/rooms.toml")),
     ("recording", include_str!("presets/recording.toml")),
     ("moving-mnist", include_str!("presets/moving-mnist.toml")),
 ];

@@ -114,8 +114,11 @@ impl<'a> RolloutRows<'a> {
         let (state, past) = (self.state(row), self.of_rows(&self.past_states, row..row + 1));
         let earlier = (past.len() / state.len().max(1)).checked_sub(back);
         if let (Some(frame), Some(_)) = (earlier, channels.pose) {
-            let earlier = &past[frame * state.len()..(frame + 1) * state.len()];
-            return self.pose(row).motion_to(channels.pose_in(earlier));
+            let earlier = channels.pose_in(&past[frame * state.len()..(frame + 1) * state.len()]);
+            let motion = self.pose(row).motion_to(earlier);
+            if motion.iter().all(|part| part.is_finite()) {
+                return motion;
+            }
         }
         let [forward, yaw_rate] = channels.measured_speeds_in(state).unwrap_or_default();
         let time = -(self.spec.frame_period_s as f32) * back as f32;

@@ -120,6 +120,17 @@ impl StateChannels {
 }
 
 impl ModelSpec {
+    /// The state's channels whose values count: all, but for the pose where it only says how the camera has moved.
+    pub(crate) fn states_read_by_layers(&self) -> Vec<usize> {
+        StateChannels::read_by_layers(self)
+    }
+
+    /// Whether a prediction uses the states at the context's earlier frames: it says from the poses how the camera has moved.
+    #[must_use]
+    pub fn reads_past_states(&self) -> bool {
+        StateChannels::of(self).pose.is_some() && self.flow().is_some_and(|flow| flow.layers.depth)
+    }
+
     /// How the camera moved from the state `[B, S]` to each of the later states `[B, T, S]`: yaw, ahead and left
     /// `[B, T, 3]`, in radians and metres. `None` if the model gets no state or the state has no pose.
     #[doc(hidden)]
