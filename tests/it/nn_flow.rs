@@ -114,7 +114,10 @@ fn every_kind_predicts_frames_and_trains_every_tensor() {
         let shape = [2, spec.horizon, spec.pixels()];
         assert_eq!(predicted.frames.dims(), shape);
         let has_scene = !spec.flow().unwrap().layers.depth;
-        assert_eq!(predicted.scene.map(|scene| scene.dims().to_vec()), has_scene.then(|| shape.to_vec()));
+        assert_eq!(
+            predicted.scene.map(|scene| scene.dims().to_vec()),
+            has_scene.then(|| shape.to_vec())
+        );
         let squares = predicted.frames.sqr().unwrap().sum_all().unwrap();
         let loss = (squares + predicted.motion.sqr().unwrap().sum_all().unwrap()).unwrap();
         let gradients = loss.backward().unwrap();

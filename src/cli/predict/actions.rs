@@ -62,7 +62,11 @@ impl ActionsFile {
     /// model takes them.
     pub(super) fn fill_in(mut self, input: &mut PredictionInput, last: usize, spec: &ModelSpec) {
         self.states.truncate(last + 1);
-        input.state = if self.states.len() > last { self.states.pop() } else { None };
+        input.state = if self.states.len() > last {
+            self.states.pop()
+        } else {
+            None
+        };
         if spec.reads_past_states() {
             let spare = self.states.len().saturating_sub(spec.context - 1);
             input.past_states = self.states.split_off(spare);

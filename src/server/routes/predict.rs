@@ -16,6 +16,7 @@ use crate::server::images::{self, ImageBytes, ImageError, ImageFormat, ImageInpu
 use crate::server::state::App;
 use foreframe_core::frame::Frame;
 use foreframe_core::frame::resize::Resize;
+use foreframe_core::frame::warp::CameraModel;
 use foreframe_core::registry::Manifest;
 use foreframe_core::serving::{InputError, Prediction, PredictionInput, ServingError, Task, Timing};
 use foreframe_core::types::{Action, RobotState};
@@ -44,6 +45,8 @@ struct PredictRequest {
     state: Option<Vec<f32>>,
     /// The robot's state at each frame, instead of `state`.
     states: Option<Vec<Vec<f32>>>,
+    /// The camera that took the images, for a model that estimates depth. Default: the model's.
+    camera: Option<CameraModel>,
     /// The future actions, as many as `steps`. The first acts from the last frame on.
     plan: Option<Vec<Vec<f32>>>,
     /// How many frames to predict. Default: the model's horizon. More are beyond what the model was trained for.
@@ -152,6 +155,7 @@ impl PredictRequest {
         let input = PredictionInput {
             state,
             past_states,
+            camera: self.camera,
             actions: actions("actions", self.actions)?,
             plan: self.plan.map(|values| actions("plan", values)).transpose()?,
             steps: self.steps,

@@ -88,6 +88,7 @@ fn simulate(manifest: &Manifest) -> Result<(PredictionInput, Vec<Frame>), SimErr
         actions: Vec::new(),
         state: Some(states[now].clone()),
         past_states: states[LEAD_IN_FRAMES..now].to_vec(),
+        camera: Some(config.camera.model_with_height()),
         plan: Some(actions[now..now + horizon].to_vec()),
         steps: None,
     };

@@ -18,6 +18,7 @@ use crate::server::images::{self, ImageBytes, ImageFormat, ImageInput};
 use crate::server::state::App;
 use foreframe_core::frame::Frame;
 use foreframe_core::frame::resize::Resize;
+use foreframe_core::frame::warp::CameraModel;
 use foreframe_core::registry::Manifest;
 use foreframe_core::serving::{ConditioningInput, Prediction, Rollout, Task, Timing};
 use foreframe_core::types::RobotState;
@@ -44,6 +45,8 @@ struct RolloutRequest {
     state: Option<Vec<f32>>,
     /// The robot's state at each frame, instead of `state`.
     states: Option<Vec<Vec<f32>>>,
+    /// The camera that took the images, for a model that estimates depth. Default: the model's.
+    camera: Option<CameraModel>,
     /// Plans: sequences of future actions, each with `steps` actions. The first action acts from the last frame on.
     plans: Vec<Vec<Vec<f32>>>,
     /// How many frames to predict. Default: the model's horizon. More are beyond what the model was trained for.
@@ -162,13 +165,7 @@ async fn session_rollouts(
     }
     let (_, given) = predict::states(request.state, None, 0)?;
     let robot_state = given.or_else(|| state.robot_state().cloned());
-    let inputs = conditioning(
-        request.plans,
-        request.steps,
-        robot_state,
-        &model.manifest,
-        app.config(),
-    )?;
+    let inputs = conditioning(request.plans, request.steps, robot_state, &model.manifest, app.config())?;
     let task = state.rollout_task(inputs, model.spec());
     let prediction = app.predictor().compute(&model, task, Some(session.key)).await?;
     let encode = move || answer(wanted, format, &[], prediction);
@@ -188,7 +185,7 @@ impl RolloutRequest {
         let (past_states, state) = predict::states(self.state, self.states, frames.len())?;
         let conditioning = conditioning(self.plans, self.steps, state, manifest, config)?;
         let seen = picture::context_for(wanted, &frames);
-        let task = Task::rollout(frames, past_states, conditioning, manifest)?;
+        let task = Task::rollout(frames, past_states, self.camera, conditioning, manifest)?;
         Ok((seen, task))
     }
 }

@@ -50,6 +50,13 @@ impl TryFrom<UncheckedCameraModel> for CameraModel {
 }
 
 impl CameraModel {
+    /// What counts where nothing is known of a camera.
+    pub(crate) const USUAL: Self = Self {
+        horizontal_fov_rad: 1.05,
+        tilt_down_rad: 0.2,
+        height_m: Some(0.3),
+    };
+
     /// A camera of that field of view and tilt, in radians, at an unknown height. Errors: `Camera` if one is out of range.
     pub fn new(horizontal_fov_rad: f32, tilt_down_rad: f32) -> Result<Self, FrameError> {
         let unchecked = UncheckedCameraModel {

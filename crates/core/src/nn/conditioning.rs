@@ -111,7 +111,10 @@ fn checked<'a>(
             )
         }
         (_, &[batch, frames, count]) => {
-            format!("[{batch}, {frames}, {count}]: windows, earlier frames, components {}", names(&spec.states))
+            format!(
+                "[{batch}, {frames}, {count}]: windows, earlier frames, components {}",
+                names(&spec.states)
+            )
         }
         _ => format!("{shape:?}: windows, components {}", names(&spec.states)),
     };

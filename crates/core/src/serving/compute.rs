@@ -9,6 +9,7 @@ use super::conditioning::ConditioningInput;
 use super::error::ServingError;
 use super::prediction::{Prediction, Rollout, Timing};
 use super::task::{Features, Task};
+use crate::frame::warp::CameraModel;
 use crate::frame::{Frame, FrameError};
 use crate::nn::tensors::with_values;
 use crate::nn::{ConditioningTensors, ModelSpec, NnError};
@@ -52,13 +53,13 @@ type RolloutRow<'a> = (u32, &'a ConditioningInput);
 fn compute(loaded: &Model, tasks: &[&Task]) -> Result<Vec<Prediction>, Failure> {
     let mut encoded = encode(loaded, tasks)?.into_iter();
     let (mut predictions, mut windows, mut rows) = (Vec::new(), Vec::new(), Vec::<RolloutRow>::new());
-    let mut past_states: Vec<&[RobotState]> = Vec::new();
+    let mut of_windows: Vec<&Task> = Vec::new();
     for task in tasks {
         let features: Vec<Features> = encoded.by_ref().take(task.frames.len()).collect();
         if !task.conditioning_inputs.is_empty() {
             let window = windows.len() as u32;
             rows.extend(task.conditioning_inputs.iter().map(|input| (window, input)));
-            past_states.push(&task.past_states);
+            of_windows.push(task);
             windows.push(task.past_features.iter().chain(&features).cloned().collect());
         }
         predictions.push(Prediction {
@@ -72,7 +73,7 @@ fn compute(loaded: &Model, tasks: &[&Task]) -> Result<Vec<Prediction>, Failure> 
     if rows.is_empty() {
         return Ok(predictions);
     }
-    let mut rollouts = Windows::new(loaded, &windows, past_states)?.predict(&rows)?.into_iter();
+    let mut rollouts = Windows::new(loaded, &windows, of_windows)?.predict(&rows)?.into_iter();
     for (task, prediction) in tasks.iter().zip(&mut predictions) {
         prediction.rollouts = rollouts.by_ref().take(task.conditioning_inputs.len()).collect();
     }
@@ -101,17 +102,13 @@ struct Windows<'a> {
     contexts: Vec<ContextStatistics>,
     /// The features of all windows `[windows, context, F]`.
     features: Tensor,
-    /// The states at each window's frames before the last one; empty where they are not known.
-    past_states: Vec<&'a [RobotState]>,
+    /// The task of each window.
+    tasks: Vec<&'a Task>,
 }
 
 impl<'a> Windows<'a> {
-    /// From the features and the earlier states of each window's frames.
-    fn new(
-        loaded: &'a Model,
-        windows: &[Vec<Features>],
-        past_states: Vec<&'a [RobotState]>,
-    ) -> Result<Self, Failure> {
+    /// From the features of each window's frames, and its task.
+    fn new(loaded: &'a Model, windows: &[Vec<Features>], tasks: Vec<&'a Task>) -> Result<Self, Failure> {
         let spec = loaded.spec();
         let values = windows
             .iter()
@@ -129,7 +126,7 @@ impl<'a> Windows<'a> {
             loaded,
             contexts,
             features: Tensor::from_vec(values, shape, &Device::Cpu)?,
-            past_states,
+            tasks,
         })
     }
 
@@ -155,6 +152,7 @@ impl<'a> Windows<'a> {
         let (window_of, inputs): (Vec<u32>, Vec<&ConditioningInput>) = rows.iter().copied().unzip();
         let conditioning = ConditioningTensors {
             past_states: self.past_states(&window_of)?,
+            cameras: self.cameras(&window_of),
             ..condition(spec, &inputs, steps)?
         };
         let network = &self.loaded.network;
@@ -177,7 +175,9 @@ impl<'a> Windows<'a> {
     fn past_states(&self, window_of: &[u32]) -> Result<Option<Tensor>, Failure> {
         let spec = self.loaded.spec();
         let (frames, channels) = (spec.context - 1, spec.states.len());
-        let of_rows = window_of.iter().map(|&window| self.past_states[window as usize]);
+        let of_rows = window_of
+            .iter()
+            .map(|&window| self.tasks[window as usize].past_states.as_slice());
         if of_rows.clone().all(<[RobotState]>::is_empty) {
             return Ok(None);
         }
@@ -188,7 +188,25 @@ impl<'a> Windows<'a> {
                 _ => values.extend(states.iter().flat_map(RobotState::as_slice)),
             }
         }
-        Ok(Some(Tensor::from_vec(values, (window_of.len(), frames, channels), &Device::Cpu)?))
+        Ok(Some(Tensor::from_vec(
+            values,
+            (window_of.len(), frames, channels),
+            &Device::Cpu,
+        )?))
+    }
+
+    /// The camera of each row; empty where the model's counts.
+    fn cameras(&self, window_of: &[u32]) -> Vec<CameraModel> {
+        let flow = self.loaded.spec().flow();
+        let Some(flow) = flow.filter(|flow| flow.layers.depth && self.tasks.iter().any(|task| task.camera.is_some()))
+        else {
+            return Vec::new();
+        };
+        let of_row = |&window: &u32| self.tasks[window as usize].camera.or(flow.camera);
+        window_of
+            .iter()
+            .map(|window| of_row(window).unwrap_or(CameraModel::USUAL))
+            .collect()
     }
 
     /// A rollout with its expected errors and its novelty. `seen`: the features of all windows.

@@ -5,6 +5,7 @@ use super::error::InputError;
 use super::ranges::range_warnings;
 use super::task::{Task, check_frames};
 use crate::frame::Frame;
+use crate::frame::warp::CameraModel;
 use crate::registry::Manifest;
 use crate::types::{Action, RobotState};
 
@@ -21,6 +22,8 @@ pub struct PredictionInput {
     /// The states at the frames before it, oldest first: a model that estimates depth reads from them how the camera has moved.
     /// Empty: it counts as having moved as fast as at the last frame.
     pub past_states: Vec<RobotState>,
+    /// The camera, if it is another than the model's. Only a model that estimates depth uses it.
+    pub camera: Option<CameraModel>,
     /// The plan: the first action acts from the last frame to the first predicted one.
     pub plan: Option<Vec<Action>>,
     /// Frames to predict; the model's horizon if absent. More are beyond what the model was trained for.
@@ -70,6 +73,7 @@ impl PredictionInput {
         Ok(Task {
             conditioning_inputs: vec![self.checked(manifest)?],
             past_states: past_states_used(self.past_states, manifest)?,
+            camera: self.camera,
             frames: self.frames,
             ..Task::default()
         })

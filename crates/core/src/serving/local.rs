@@ -11,6 +11,7 @@ use super::ranges::range_warnings;
 use super::session::{SessionSnapshot, SessionState, SnapshotError};
 use super::task::{Task, check_size};
 use crate::frame::Frame;
+use crate::frame::warp::CameraModel;
 use crate::registry::Model;
 use crate::types::{Action, RobotState};
 
@@ -52,6 +53,11 @@ impl Session {
     pub fn restore(model: Arc<Model>, snapshot: SessionSnapshot) -> Result<Self, SnapshotError> {
         let state = SessionState::restore(snapshot, &model.manifest)?;
         Ok(Self { model, state })
+    }
+
+    /// From now on the frames are this camera's. Only a model that estimates depth uses it; without it, the model's counts.
+    pub fn set_camera(&mut self, camera: CameraModel) {
+        self.state.set_camera(camera);
     }
 
     /// Takes the next frame and predicts the frames that follow; `None` until the context is full. `state` is the robot's

@@ -20,8 +20,13 @@ pub(super) fn range_warnings(manifest: &Manifest, inputs: &[ConditioningInput]) 
     let read = spec.states_read_by_layers();
     let mut warnings = Vec::new();
     for channel in read {
-        let (channels, ranges) = (spec.states.get(channel..=channel), calibration.states.get(channel..=channel));
-        let (Some(channels), Some(ranges)) = (channels, ranges) else { continue };
+        let (channels, ranges) = (
+            spec.states.get(channel..=channel),
+            calibration.states.get(channel..=channel),
+        );
+        let (Some(channels), Some(ranges)) = (channels, ranges) else {
+            continue;
+        };
         let values: Vec<&[f32]> = states.iter().filter_map(|state| state.get(channel..=channel)).collect();
         warnings.extend(warnings_of("state", channels, ranges, &values));
     }

@@ -9,6 +9,7 @@ use super::conditioning::{ConditioningInput, FieldNames, RawConditioning, check_
 use super::error::InputError;
 use super::task::{Features, Task};
 use crate::frame::Frame;
+use crate::frame::warp::CameraModel;
 use crate::nn::ModelSpec;
 use crate::registry::Manifest;
 use crate::types::{Action, RobotState};
@@ -54,7 +55,9 @@ pub enum SnapshotError {
         frames: usize,
     },
     /// More past states than frames before the last one.
-    #[error("snapshot.past_states holds {found} states; snapshot.features holds {frames} frames, and the last one's is in snapshot.state")]
+    #[error(
+        "snapshot.past_states holds {found} states; snapshot.features holds {frames} frames, and the last one's is in snapshot.state"
+    )]
     StateCount {
         /// States given.
         found: usize,
@@ -85,6 +88,9 @@ pub struct SessionSnapshot {
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     #[cfg_attr(feature = "schema", schema(value_type = Vec<Vec<f32>>))]
     pub past_states: Vec<RobotState>,
+    /// The camera, if it is another than the model's.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub camera: Option<CameraModel>,
     /// How many frames the last prediction had; absent: the model's horizon.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub steps: Option<usize>,
@@ -97,6 +103,8 @@ pub struct SessionState {
     features: VecDeque<Features>,
     /// The states at the frames before the last one, at most one less than the context; kept if the model reads them.
     past_states: VecDeque<RobotState>,
+    /// If it is another than the model's.
+    camera: Option<CameraModel>,
     /// The last one.
     pub(super) conditioning: ConditioningInput,
 }
@@ -143,6 +151,7 @@ impl SessionState {
         };
         Ok(Self {
             past_states: past_states.into(),
+            camera: snapshot.camera,
             next_seq: snapshot.next_seq,
             features: snapshot.features.into_iter().map(Features::from).collect(),
             conditioning,
@@ -158,8 +167,14 @@ impl SessionState {
             actions: self.conditioning.actions.clone(),
             state: self.conditioning.state.clone(),
             past_states: self.past_states.iter().cloned().collect(),
+            camera: self.camera,
             steps: self.conditioning.steps,
         }
+    }
+
+    /// From now on the frames are this camera's. Only a model that estimates depth uses it.
+    pub fn set_camera(&mut self, camera: CameraModel) {
+        self.camera = Some(camera);
     }
 
     /// The expected sequence number of the next frame.
@@ -190,6 +205,7 @@ impl SessionState {
         Task {
             past_features,
             past_states: last_states(past_states.cloned().collect(), spec),
+            camera: self.camera,
             frames: vec![frame],
             conditioning_inputs: conditioning.filter(|_| is_full).into_iter().collect(),
         }
@@ -223,6 +239,7 @@ impl SessionState {
         Task {
             past_features: self.features.iter().cloned().collect(),
             past_states: last_states(self.past_states.iter().cloned().collect(), spec),
+            camera: self.camera,
             frames: Vec::new(),
             conditioning_inputs,
         }
@@ -288,6 +305,7 @@ mod tests {
                 actions: actions.into_iter().map(action).collect(),
                 state: state.and_then(|value| RobotState::try_from(vec![value]).ok()),
                 past_states: Vec::new(),
+                camera: None,
                 steps: None,
             };
             let is_sound = snapshot.features.len() <= 3
@@ -315,6 +333,7 @@ mod tests {
             actions: vec![action(0.0); 2],
             state: RobotState::try_from(vec![0.0]).ok(),
             past_states: Vec::new(),
+            camera: None,
             steps: None,
         };
         snapshot.features[0][3] = f32::NAN;

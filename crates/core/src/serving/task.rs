@@ -5,6 +5,7 @@ use std::sync::Arc;
 use super::conditioning::{ConditioningInput, past_states_used};
 use super::error::InputError;
 use crate::frame::Frame;
+use crate::frame::warp::CameraModel;
 use crate::registry::Manifest;
 use crate::types::RobotState;
 
@@ -20,22 +21,26 @@ pub struct Task {
     pub(super) frames: Vec<Frame>,
     /// The states at the context's frames before the last one, oldest first; empty where they are not known or not used.
     pub(super) past_states: Vec<RobotState>,
+    /// The camera, if it is another than the model's.
+    pub(super) camera: Option<CameraModel>,
     /// One for each rollout; empty while the context is not full.
     pub(super) conditioning_inputs: Vec<ConditioningInput>,
 }
 
 impl Task {
     /// One rollout for each conditioning input from the context in `frames`, with the states at its frames before the last
-    /// one, if they are known. Errors: those of the frames and of the states.
+    /// one and the camera, if they are known. Errors: those of the frames and of the states.
     pub fn rollout(
         frames: Vec<Frame>,
         past_states: Vec<RobotState>,
+        camera: Option<CameraModel>,
         conditioning_inputs: Vec<ConditioningInput>,
         manifest: &Manifest,
     ) -> Result<Self, InputError> {
         check_frames(&frames, manifest)?;
         Ok(Self {
             past_states: past_states_used(past_states, manifest)?,
+            camera,
             frames,
             conditioning_inputs,
             ..Self::default()
@@ -51,6 +56,7 @@ impl Task {
         Self {
             past_features: self.past_features.clone(),
             past_states: self.past_states.clone(),
+            camera: self.camera,
             frames: std::mem::take(&mut self.frames),
             conditioning_inputs: std::mem::replace(&mut self.conditioning_inputs, later),
         }

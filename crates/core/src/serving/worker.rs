@@ -101,6 +101,7 @@ pub(super) fn blank_input(model: &Model) -> PredictionInput {
         actions: Action::try_from(vec![0.0; spec.actions.len()]).into_iter().collect(),
         state: RobotState::try_from(vec![0.0; spec.states.len()]).ok(),
         past_states: Vec::new(),
+        camera: None,
         plan: None,
         steps: None,
     }

@@ -162,11 +162,16 @@ impl<'a> Inference<'a> {
             let states = windows.iter().map(|window| dataset.state(window.first_frame + last));
             let states = states.collect::<Vec<_>>().concat();
             condition.state = Some(Tensor::from_vec(states, (batch, count), &Device::Cpu)?);
-            let earlier = windows.iter().flat_map(|window| window.first_frame..window.first_frame + last);
+            let earlier = windows
+                .iter()
+                .flat_map(|window| window.first_frame..window.first_frame + last);
             let earlier = earlier.map(|frame| dataset.state(frame)).collect::<Vec<_>>().concat();
             condition.past_states = Some(Tensor::from_vec(earlier, (batch, last, count), &Device::Cpu)?);
         }
-        condition.cameras = windows.iter().map_while(|window| dataset.camera(window.episode)).collect();
+        condition.cameras = windows
+            .iter()
+            .map_while(|window| dataset.camera(window.episode))
+            .collect();
         Ok(condition)
     }
 }

@@ -8,6 +8,7 @@ use super::TrainError;
 use super::observer::TrainingStage;
 use super::optimizer::{OptimizerConfig, UpdateRule};
 use foreframe_core::frame::preprocess::Preprocess;
+use foreframe_core::frame::warp::CameraModel;
 use foreframe_core::nn::loss::Loss;
 use foreframe_core::nn::{
     Architecture, ArchitectureKind, ChannelScale, Conditioning, DenseSpec, FlowLayers, FlowSpec, ModelSpec,
@@ -316,7 +317,10 @@ impl TrainConfig {
             }),
             ArchitectureKind::Flow => Architecture::Flow(FlowSpec {
                 layers: model.flow.unwrap_or_default(),
-                camera: info.camera,
+                camera: match model.flow {
+                    Some(layers) if layers.depth => mean_camera(dataset).or(info.camera),
+                    _ => info.camera,
+                },
             }),
         };
         ModelSpec {
@@ -332,6 +336,21 @@ impl TrainConfig {
             states,
         }
     }
+}
+
+/// The mean of the episodes' cameras: what a model that serves any camera takes where a request names none.
+fn mean_camera(dataset: &Dataset) -> Option<CameraModel> {
+    let cameras: Vec<CameraModel> = (0..dataset.episodes().len())
+        .filter_map(|episode| dataset.camera(episode))
+        .collect();
+    let heights: Vec<f32> = cameras.iter().filter_map(|camera| camera.height_m).collect();
+    let mean = |values: &[f32]| values.iter().sum::<f32>() / values.len().max(1) as f32;
+    let of = |value: fn(&CameraModel) -> f32| mean(&cameras.iter().map(value).collect::<Vec<_>>());
+    (!cameras.is_empty()).then(|| CameraModel {
+        horizontal_fov_rad: of(|camera| camera.horizontal_fov_rad),
+        tilt_down_rad: of(|camera| camera.tilt_down_rad),
+        height_m: (!heights.is_empty()).then(|| mean(&heights)),
+    })
 }
 
 /// Mean and standard deviation of each channel over the frames.

@@ -11,6 +11,7 @@ use crate::server::state::App;
 use crate::server::stream::protocol::{OnGap, OnLate, SessionSettings, StreamLimits};
 use crate::server::stream::session::Session;
 use foreframe_core::frame::resize::Resize;
+use foreframe_core::frame::warp::CameraModel;
 use foreframe_core::registry::Model;
 use foreframe_core::serving::{SessionSnapshot, SessionState};
 
@@ -28,6 +29,8 @@ pub(super) struct CreateSession {
     pub(super) format: Option<ImageFormat>,
     /// How a frame of another size is resized; without it, another size is an error.
     pub(super) resize: Option<Resize>,
+    /// The camera that takes the frames, for a model that estimates depth. Default: that of `state`, else the model's.
+    pub(super) camera: Option<CameraModel>,
     /// A state from `GET /v1/sessions/{id}/state` of this or another server: the session continues from it.
     pub(super) state: Option<ExportedState>,
 }
@@ -102,7 +105,7 @@ pub(super) struct SessionList {
 
 impl CreateSession {
     pub(super) fn resolve(self, app: &App) -> Result<(Arc<Model>, SessionState, SessionSettings), ApiError> {
-        let (on_gap, on_late, resize) = (self.on_gap, self.on_late, self.resize);
+        let (on_gap, on_late, resize, camera) = (self.on_gap, self.on_late, self.resize, self.camera);
         let format = self.format.map(ImageFormat::answer);
         let Some(exported) = self.state else {
             let Some(name) = self.model else {
@@ -116,7 +119,9 @@ impl CreateSession {
                 format,
                 resize,
             };
-            return Ok((app.predictor().active(&name)?, SessionState::default(), settings));
+            let mut state = SessionState::default();
+            camera.into_iter().for_each(|camera| state.set_camera(camera));
+            return Ok((app.predictor().active(&name)?, state, settings));
         };
         if let Some(name) = self.model.filter(|name| *name != exported.model) {
             return Err(ApiError::Unprocessable(format!(
@@ -138,8 +143,9 @@ impl CreateSession {
             format: format.or(exported.format.map(ImageFormat::answer)),
             resize: resize.or(exported.resize),
         };
-        let state = SessionState::restore(exported.snapshot, manifest)
+        let mut state = SessionState::restore(exported.snapshot, manifest)
             .map_err(|error| ApiError::Unprocessable(format!("state.{error}")))?;
+        camera.into_iter().for_each(|camera| state.set_camera(camera));
         Ok((model, state, settings))
     }
 }

@@ -104,7 +104,10 @@ impl FlowNetwork {
         // The composition's tensor has the place before the turn first.
         let frames = composition.compose(&head, &no_content, &places)?;
         let level = |part: usize| -> Result<Tensor, NnError> {
-            let levels: Vec<f32> = context_of.iter().map(|&context| views.levels[context as usize][part]).collect();
+            let levels: Vec<f32> = context_of
+                .iter()
+                .map(|&context| views.levels[context as usize][part])
+                .collect();
             Ok(Tensor::from_vec(levels, (context_of.len(), 1), &Device::Cpu)?)
         };
         let frames = frames.broadcast_mul(&level(1)?)?.broadcast_add(&level(0)?)?;
@@ -152,7 +155,11 @@ impl SeenPlaces {
                 values.push(f32::from(u8::from(is_seen)));
             }
         }
-        Ok(Tensor::from_vec(values, (context_of.len(), quarter.height, quarter.width, ()), &Device::Cpu)?)
+        Ok(Tensor::from_vec(
+            values,
+            (context_of.len(), quarter.height, quarter.width, ()),
+            &Device::Cpu,
+        )?)
     }
 
     /// What the fine layers read beside the moved pixels, `[M, H/2, W/2, FINE_VALUES]`.
@@ -171,6 +178,10 @@ impl SeenPlaces {
                 values.push((outside / OUTSIDE_PX).min(MAX_OUTSIDE));
             }
         }
-        Ok(Tensor::from_vec(values, (context_of.len(), half.height, half.width, ()), &Device::Cpu)?)
+        Ok(Tensor::from_vec(
+            values,
+            (context_of.len(), half.height, half.width, ()),
+            &Device::Cpu,
+        )?)
     }
 }

@@ -12,12 +12,6 @@ use crate::nn::geometry::camera::{Viewer, rotated};
 use crate::nn::ops::sampling::ImageSize;
 use crate::vectorized::vectorized;
 
-/// The camera where nothing is known of it.
-const USUAL_CAMERA: CameraModel = CameraModel {
-    horizontal_fov_rad: 1.05,
-    tilt_down_rad: 0.2,
-    height_m: Some(USUAL_HEIGHT_M),
-};
 /// Height of a camera whose height is not known.
 const USUAL_HEIGHT_M: f32 = 0.3;
 /// Distance of everything that the floor does not explain, before anything is learned.
@@ -67,7 +61,7 @@ impl DepthViews {
         };
         let earlier = contexts.frames_read - 1;
         for index in 0..contexts.count() {
-            let camera = contexts.cameras[index].unwrap_or(USUAL_CAMERA);
+            let camera = contexts.cameras[index].unwrap_or(CameraModel::USUAL);
             let viewer = Viewer::new(camera, size);
             let depths = depths_before_learning(viewer, camera.height_m.unwrap_or(USUAL_HEIGHT_M));
             let frame = &mut views.frames[index * pixels..(index + 1) * pixels];

@@ -15,7 +15,12 @@ use crate::nn::tensors::with_values;
 
 impl FlowNetwork {
     /// All steps of the rollouts at once; gives the frames of the first `steps`.
-    pub(super) fn predict_directly(&self, rows: &RolloutRows, steps: usize, scene: &Scene) -> Result<FlowPrediction, NnError> {
+    pub(super) fn predict_directly(
+        &self,
+        rows: &RolloutRows,
+        steps: usize,
+        scene: &Scene,
+    ) -> Result<FlowPrediction, NnError> {
         let size = self.spec.image_size();
         let shape = (rows.count(), self.spec.horizon, size.pixels());
         let motion = self.motion.forward(rows)?;

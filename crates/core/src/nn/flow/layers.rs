@@ -116,7 +116,12 @@ fn layer_sizes(spec: &ModelSpec, flow: &FlowSpec) -> Vec<LayerSize> {
     }
     if sizes.depth {
         layer("depth.enlarge", channels, 4 * sizes.enlarged_channels, quarter);
-        layer("depth.output", TAPS * (sizes.enlarged_channels + sizes.stem_channels), 4, half);
+        layer(
+            "depth.output",
+            TAPS * (sizes.enlarged_channels + sizes.stem_channels),
+            4,
+            half,
+        );
     }
     let mixed = channels
         + match (sizes.depth, sizes.recurrent) {

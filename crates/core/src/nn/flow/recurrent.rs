@@ -20,7 +20,12 @@ const BLOCK_PIXELS: usize = MOVED_CHANNELS - 1;
 
 impl FlowNetwork {
     /// The rollouts of a model that takes no actions: its camera stands. Only the first `steps` frames are computed.
-    pub(super) fn predict_recurrently(&self, rows: &RolloutRows, steps: usize, scene: &Scene) -> Result<FlowPrediction, NnError> {
+    pub(super) fn predict_recurrently(
+        &self,
+        rows: &RolloutRows,
+        steps: usize,
+        scene: &Scene,
+    ) -> Result<FlowPrediction, NnError> {
         let (count, horizon, size) = (rows.count(), self.spec.horizon, self.spec.image_size());
         let motion = Tensor::zeros((count, horizon, 3), DType::F32, &Device::Cpu)?;
         let contexts = rows.contexts(self.sizes.layers.frames_read);

@@ -221,13 +221,20 @@ mod tests {
             let (x, y) = ((pixel % 8) as f32 - 3.5, (pixel / 8) as f32 - 2.5);
             // The wall is 2.5 m away now and was 3 m away.
             let expected = [x + 3.5, y + 2.5, x / 1.2 + 3.5, y / 1.2 + 2.5, 2.5];
-            assert!(place.iter().zip(expected).all(|(a, b)| (a - b).abs() < 5e-3), "{place:?} {expected:?}");
+            assert!(
+                place.iter().zip(expected).all(|(a, b)| (a - b).abs() < 5e-3),
+                "{place:?} {expected:?}"
+            );
         }
     }
 
     #[test]
     fn gradients_agree_with_differences() {
-        let motions = Tensor::new(&[[0.1f32, 0.03, 0.1], [-0.2, 0.02, 0.0], [0.0, -0.01, 0.05]], &Device::Cpu).unwrap();
+        let motions = Tensor::new(
+            &[[0.1f32, 0.03, 0.1], [-0.2, 0.02, 0.0], [0.0, -0.01, 0.05]],
+            &Device::Cpu,
+        )
+        .unwrap();
         assert_gradients(&[wall(2.0)], 1e-2, |inputs| {
             reproject(reprojection(), &inputs[0], &motions)?.narrow(2, 0, 4)
         });

@@ -203,7 +203,9 @@ impl<'a> RolloutRows<'a> {
                 }
                 views.states.push(self.state(row).to_vec());
                 views.poses.push(self.pose(row));
-                views.motions_back.extend((1..frames_read).map(|back| self.motion_back(row, back)));
+                views
+                    .motions_back
+                    .extend((1..frames_read).map(|back| self.motion_back(row, back)));
                 views.cameras.push(self.camera(row));
             }
             views.row_of.push(views.poses.len() as u32 - 1);
