@@ -44,9 +44,9 @@ use self::progress::EvaluationContext;
 use self::report::{ModelSummary, ReportStamp, SetOutcome, SetReport, SetScores};
 use self::windows::{evenly, window_shape};
 use foreframe_core::registry::Model;
-use foreframe_data::dataset::{Dataset, Window};
 use foreframe_data::dataset::moving_mnist::MOVING_MNIST;
 use foreframe_data::dataset::sampler::{Split, Splits};
+use foreframe_data::dataset::{Dataset, Window};
 use foreframe_sim::RoomSet;
 
 /// Scores the model on the splits that [`EvaluateConfig::split`] names: the validation split, the three test sets

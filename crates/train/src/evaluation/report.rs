@@ -287,12 +287,7 @@ pub struct SetScores {
 
 impl SetScores {
     /// The scores of these windows, whose rows are the methods. What else a set may have is filled in later.
-    pub(super) fn new(
-        methods: &[Method],
-        windows: &[WindowScores],
-        bootstrap: &Bootstrap,
-        is_recording: bool,
-    ) -> Self {
+    pub(super) fn new(methods: &[Method], windows: &[WindowScores], bootstrap: &Bootstrap, is_recording: bool) -> Self {
         let trial_of: Vec<usize> = windows.iter().map(|window| window.group).collect();
         let by_trial = |of: fn(&WindowScores) -> &[f64]| TrialSums::group(&trial_of, windows.iter().map(of));
         let own_space = by_trial(|window| &window.model_space_mse);

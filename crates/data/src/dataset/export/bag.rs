@@ -97,7 +97,9 @@ fn write(dataset: &Dataset, episodes: &[Range<usize>], mut bag: McapWriter<'_>) 
 
 /// The camera of the episode with these frames.
 fn camera_of(dataset: &Dataset, frames: &Range<usize>) -> Option<CameraModel> {
-    let begun = dataset.episodes().partition_point(|episode| episode.first_frame <= frames.start);
+    let begun = dataset
+        .episodes()
+        .partition_point(|episode| episode.first_frame <= frames.start);
     dataset.camera(begun.checked_sub(1)?)
 }
 

@@ -71,7 +71,8 @@ pub(super) fn describe(
         (None, Some(found)) => found.horizontal_fov_rad,
         (None, None) => {
             return Err(ImportError::Option(
-                "--tilt and --camera-height need --fov, since the recording does not say the camera's field of view".to_owned(),
+                "--tilt and --camera-height need --fov, since the recording does not say the camera's field of view"
+                    .to_owned(),
             ));
         }
     };

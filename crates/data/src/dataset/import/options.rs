@@ -77,7 +77,10 @@ pub struct ImportOptions {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub fov_deg: Option<f64>,
     /// How far the camera looks down from the horizontal, -85 to 85 degrees [default: 0, if the field of view is known]
-    #[cfg_attr(feature = "cli", arg(long = "tilt", value_name = "DEGREES", allow_negative_numbers = true))]
+    #[cfg_attr(
+        feature = "cli",
+        arg(long = "tilt", value_name = "DEGREES", allow_negative_numbers = true)
+    )]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub tilt_deg: Option<f64>,
     /// Height of the camera above the floor, 0.01 to 10 metres
@@ -154,7 +157,9 @@ impl ImportOptions {
 
     /// Whether they say something of the camera.
     pub(super) fn describes_camera(&self) -> bool {
-        [self.fov_deg, self.tilt_deg, self.camera_height_m].iter().any(Option::is_some)
+        [self.fov_deg, self.tilt_deg, self.camera_height_m]
+            .iter()
+            .any(Option::is_some)
     }
 
     /// A channel with the unit that `--unit NAME=UNIT` gives it, or else with that of the source.

@@ -172,7 +172,11 @@ impl ImportSpec {
         match options.validate() {
             Ok(()) => Ok(options),
             Err(ImportError::OptionValue { option, value, right }) => {
-                let field = if option == "camera-height" { "camera_height" } else { option };
+                let field = if option == "camera-height" {
+                    "camera_height"
+                } else {
+                    option
+                };
                 Err(wrong(field, &value, &right))
             }
             Err(other) => Err(JobError::invalid("source", other.to_string())),
