@@ -192,7 +192,7 @@ fn simulation(args: &CollectArgs, scenario: Scenario, out: &Path) -> CollectConf
 
 /// A training command that works on the data set, or what to do if it is too small to train on.
 fn next_step(args: &CollectArgs, out: &Path, info: &DatasetInfo) -> Result<String, CliError> {
-    if let Some(RoomSet::NewMaterials | RoomSet::NewCameras) = args.rooms {
+    if args.rooms.is_some_and(RoomSet::is_only_for_tests) {
         let out = out.display();
         return Ok(format!(
             "foreframe evaluate --model MODEL --dataset {out} (these rooms are only for tests)"

@@ -18,7 +18,8 @@ use foreframe_train::evaluation::{self, EvaluateConfig, EvaluationReport, NEARES
 
 /// Measure a model on data that training never saw, and write a report with figures and a GIF.
 ///
-/// There are three test sets: trials, start/goal pairs and controller gains that training never saw. The skill is 1 − MSE / MSE
+/// There are three test sets: trials, start/goal pairs (where robots drive to one goal) and controller gains that training never
+/// saw. Of rooms that are only for tests, all trials are scored. The skill is 1 − MSE / MSE
 /// of the strongest baseline: 1 is perfect, 0 is no better than the baseline. To choose between models or settings, use `--split
 /// validation`; the test sets are for the final numbers.
 #[derive(clap::Args)]
@@ -48,7 +49,7 @@ pub(super) struct EvaluateArgs {
     /// What to score
     #[arg(long, value_enum, default_value_t = SplitChoice::Test)]
     split: SplitChoice,
-    /// Windows of each set at most, spread evenly over its trials
+    /// Windows of each set at most, spread evenly over its trials or blocks of time
     #[arg(long, default_value_t = EvaluateConfig::default().max_windows)]
     windows: usize,
     /// Training windows among which the baseline looks for the 8 nearest, at most; evenly spread if there are more. Each takes up
@@ -56,7 +57,7 @@ pub(super) struct EvaluateArgs {
     /// with a baseline that knows as little
     #[arg(long, value_name = "WINDOWS", default_value_t = NEAREST_WINDOWS as u32, value_parser = value_parser!(u32).range(1..))]
     nearest_windows: u32,
-    /// Bootstrap resamples of the trials, for the intervals
+    /// Bootstrap resamples of the trials or blocks of time, for the intervals
     #[arg(long, default_value_t = EvaluateConfig::default().bootstrap_samples as u32, value_parser = value_parser!(u32).range(1..=MAX_RESAMPLES as i64))]
     resamples: u32,
     /// The seed of the resamples and of the shuffled actions
@@ -139,6 +140,9 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<(), CliError> {
     output.finish()?;
     if args.save_scores {
         let mut scores = report.headline();
+        for skipped in report.sets.iter().filter(|set| set.outcome.scores().is_none()) {
+            scores[&skipped.split] = serde_json::Value::Null;
+        }
         if config.split == ScoredSplit::Test {
             // Earlier versions scored unseen pairs and gains as one set.
             scores["test-unseen"] = serde_json::Value::Null;

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use foreframe_core::error_text::with_causes;
+use foreframe_core::frame::warp::CameraModel;
 use foreframe_core::frame::{Frame, codec};
 use foreframe_data::dataset::Dataset;
 use foreframe_data::dataset::import::{DEFAULT_DISK_MIB, ImportConfig, ImportError, ImportOptions, Imported, import};
@@ -130,6 +131,40 @@ fn a_bag_becomes_frames_with_actions_and_states() {
     // 2 · atan(16 / 2 / 8).
     let camera = info.camera.unwrap();
     assert!((camera.horizontal_fov_rad.to_degrees() - 90.0).abs() < 1e-3);
+}
+
+#[test]
+fn options_replace_what_a_bag_says_of_its_camera() {
+    let dir = tempfile::tempdir().unwrap();
+    let camera = |name: &str, messages: &[BagMessage], options: ImportOptions| {
+        let source = bag(dir.path(), &format!("{name}.mcap"), &mcap(messages, Chunks::Plain, 7));
+        run(&source, &dir.path().join(name), options).unwrap().info.camera
+    };
+    let degrees =
+        |camera: CameraModel| [camera.horizontal_fov_rad, camera.tilt_down_rad].map(|angle| angle.to_degrees().round());
+    let tilted = ImportOptions {
+        tilt_deg: Some(20.0),
+        ..options()
+    };
+    assert_eq!(degrees(camera("a", &drive(false), tilted).unwrap()), [90.0, 20.0]);
+    let narrower = ImportOptions {
+        fov_deg: Some(60.0),
+        ..options()
+    };
+    assert_eq!(
+        degrees(camera("b", &drive(false), narrower.clone()).unwrap()),
+        [60.0, 0.0]
+    );
+    let mut changing = drive(false);
+    let type_name = "sensor_msgs/msg/CameraInfo";
+    changing.push(message(
+        "/camera/camera_info",
+        type_name,
+        START_NS + 1,
+        camera_info(SIZE, 9.0),
+    ));
+    assert_eq!(camera("c", &changing, options()), None);
+    assert_eq!(degrees(camera("d", &changing, narrower).unwrap()), [60.0, 0.0]);
 }
 
 #[test]

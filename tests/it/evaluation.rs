@@ -7,12 +7,13 @@ use foreframe_core::nn::{ChannelScale, Conditioning, ModelSpec};
 use foreframe_core::registry::Model;
 use foreframe_core::types::{Channel, Seed};
 use foreframe_data::dataset::{CollectConfig, Dataset, Split, Splits, collect};
-use foreframe_sim::{Scenario, WorldConfig};
+use foreframe_sim::{RoomSet, Scenario, WorldConfig};
 use foreframe_train::evaluation::actions::Variant;
 use foreframe_train::evaluation::method::Method;
 use foreframe_train::evaluation::plans::PlanOutcome;
 use foreframe_train::evaluation::report::{EvaluationReport, SetOutcome};
 use foreframe_train::evaluation::{self, EvaluateConfig, EvaluationError, ScoredSplit};
+use serde_json::{Value, json};
 
 use crate::fixtures::{self, moving_squares};
 
@@ -67,7 +68,9 @@ fn every_method_is_scored_and_skipped_sets_give_reasons() {
     let report = evaluate(&model, &dataset, &with_twin).unwrap();
     let scores = report.scores("test").unwrap();
     assert_eq!((scores.windows, scores.methods.len()), (15, 10));
-    assert!(scores.trials >= 2 && scores.windows_available > 15);
+    assert!(
+        scores.blocks.is_some_and(|blocks| blocks >= 2) && scores.trials.is_none() && scores.windows_available > 15
+    );
     assert!(scores.skill.skill.mean <= 0.0, "an untrained model has no skill");
     for row in &scores.methods {
         assert_eq!(row.mse.per_step.len(), 3);
@@ -174,7 +177,7 @@ fn each_twin_is_named_by_what_it_lacks() {
 }
 
 #[test]
-fn on_simulated_data_all_sets_are_scored_and_plans_are_compared() {
+fn on_simulated_data_trials_and_gains_are_scored_and_plans_are_compared() {
     let dir = tempfile::tempdir().unwrap();
     let collection = CollectConfig {
         world: WorldConfig {
@@ -200,7 +203,9 @@ fn on_simulated_data_all_sets_are_scored_and_plans_are_compared() {
     };
     let model = untrained("driving", spec, &dataset);
     let report = evaluate(&model, &dataset, &config()).unwrap();
-    for set in &report.sets {
+    // Robots drive on to other goals.
+    assert!(matches!(&report.sets[1].outcome, SetOutcome::Skipped { reason } if reason.contains("drive on")));
+    for set in report.sets.iter().filter(|set| set.split != "unseen-pairs") {
         let scores = set.outcome.scores().unwrap();
         let ego_motion = scores
             .methods
@@ -222,8 +227,75 @@ fn on_simulated_data_all_sets_are_scored_and_plans_are_compared() {
     let figures = evaluation::draw_figures(&model, &dataset, &report).unwrap();
     let files = figures.iter().map(|figure| figure.about.file.as_str());
     let predictions: Vec<&str> = files.filter(|file| file.starts_with("prediction-")).collect();
-    assert_eq!(predictions.len(), 9);
-    assert_eq!(predictions[3], "prediction-median-unseen-pairs.png");
+    assert_eq!(predictions.len(), 6);
+    assert_eq!(predictions[3], "prediction-median-unseen-gains.png");
+}
+
+#[test]
+fn rooms_that_are_only_for_tests_are_scored_as_a_whole() {
+    let dir = tempfile::tempdir().unwrap();
+    let collection = CollectConfig {
+        world: WorldConfig {
+            frame_width_px: SIDE,
+            frame_height_px: SIDE,
+            max_duration_s: 3.0,
+            rooms: Some(RoomSet::NewCameras),
+            ..WorldConfig::default()
+        },
+        ..CollectConfig::new(Scenario::MovingObserver, 12, Seed(2), &dir.path().join("set"))
+    };
+    collect(&collection, &|_| {}, &AtomicBool::new(false)).unwrap();
+    let dataset = Dataset::open(&collection.out).unwrap();
+    let other = moving_squares(40, SIDE, 0.2);
+    let every_window = EvaluateConfig {
+        max_windows: 1000,
+        ..config()
+    };
+    let report = evaluate(
+        &untrained("new", spec(Conditioning::None), &other),
+        &dataset,
+        &every_window,
+    )
+    .unwrap();
+    assert_eq!(report.stamp.split, ScoredSplit::WholeSet);
+    let sets: Vec<&str> = report.sets.iter().map(|set| set.split.as_str()).collect();
+    assert_eq!(sets, ["new-cameras"]);
+    let scores = report.scores("new-cameras").unwrap();
+    assert_eq!((scores.trials, scores.intervals_are_reliable), (Some(12), true));
+    let methods: Vec<Method> = scores.methods.iter().map(|row| row.method).collect();
+    assert!(methods.contains(&Method::GroundAndWall) && methods.contains(&Method::PlaneSweep));
+    assert!(report.headline()["new-cameras"]["skill"].is_number());
+    // Of a model that was trained in these rooms, the test split is scored.
+    let report = evaluate(
+        &untrained("own", spec(Conditioning::None), &dataset),
+        &dataset,
+        &config(),
+    )
+    .unwrap();
+    assert_eq!(report.stamp.split, ScoredSplit::Test);
+}
+
+#[test]
+fn an_interval_of_few_blocks_is_marked() {
+    let dataset = moving_squares(12, SIDE, 0.2);
+    let model = untrained("still", spec(Conditioning::None), &dataset);
+    let report = evaluate(&model, &dataset, &config()).unwrap();
+    let scores = report.scores("test").unwrap();
+    let blocks = scores.blocks.unwrap();
+    assert!((2..10).contains(&blocks) && !scores.intervals_are_reliable);
+    let markdown = report.to_markdown();
+    let expected =
+        format!("Do not trust the intervals of this set: {blocks} blocks are too few, at least 10 are needed.");
+    assert!(
+        markdown.contains(&expected) && markdown.contains("(do not trust it)"),
+        "{markdown}"
+    );
+    let headline = &report.headline()["test"];
+    assert_eq!(
+        (&headline["blocks"], &headline["trials"]),
+        (&json!(blocks), &Value::Null)
+    );
+    assert_eq!(headline["skill_interval_is_reliable"], false);
 }
 
 #[test]

@@ -1,14 +1,16 @@
 //! Data sets as bags of ROS 2. `tests/python/import_bags.py` reads them with the packages of ROS users.
 
 use std::fs;
+use std::ops::Range;
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
 use foreframe_core::frame::warp::CameraModel;
-use foreframe_core::types::Channel;
+use foreframe_core::types::{Channel, Seed};
 use foreframe_data::dataset::export::{ACTION_TOPIC, STATE_TOPIC, to_mcap};
 use foreframe_data::dataset::import::{DEFAULT_DISK_MIB, ImportConfig, ImportOptions, import};
-use foreframe_data::dataset::{Dataset, DatasetInfo, Episode, EpisodeData};
+use foreframe_data::dataset::{CollectConfig, Dataset, DatasetInfo, Episode, EpisodeData, collect};
+use foreframe_sim::{RoomSet, Scenario, WorldConfig};
 
 use crate::process::{output, text};
 use crate::recordings;
@@ -38,9 +40,14 @@ fn dataset(actions: &[(&str, &str)], states: &[(&str, &str)], period_s: f64) -> 
 }
 
 fn exported_and_imported(dataset: &Dataset, dir: &Path) -> Dataset {
-    let (bag, out) = (dir.join("made.mcap"), dir.join("back"));
     let episodes: Vec<_> = dataset.episodes().iter().map(Episode::frames).collect();
-    to_mcap(dataset, &episodes, &bag).unwrap();
+    imported_from(dataset, &episodes, dir)
+}
+
+/// Some episodes, exported and imported again.
+fn imported_from(dataset: &Dataset, episodes: &[Range<usize>], dir: &Path) -> Dataset {
+    let (bag, out) = (dir.join("made.mcap"), dir.join("back"));
+    to_mcap(dataset, episodes, &bag).unwrap();
     let config = ImportConfig {
         source: bag,
         out: out.clone(),
@@ -95,6 +102,33 @@ fn velocities_come_back_as_the_same_channels() {
     assert_eq!(names(&back.info().state_channels), ["linear.x m/s", "angular.z rad/s"]);
     let fov = back.info().camera.unwrap().horizontal_fov_rad;
     assert!((fov - 1.2).abs() < 1e-5, "{fov}");
+}
+
+#[test]
+fn each_episode_has_the_messages_of_its_own_camera() {
+    let dir = tempfile::tempdir().unwrap();
+    let collection = CollectConfig {
+        world: WorldConfig {
+            frame_width_px: 12,
+            frame_height_px: 8,
+            max_duration_s: 1.6,
+            rooms: Some(RoomSet::Varied),
+            ..WorldConfig::default()
+        },
+        ..CollectConfig::new(Scenario::MovingObserver, 2, Seed(4), &dir.path().join("set"))
+    };
+    collect(&collection, &|_| {}, &AtomicBool::new(false)).unwrap();
+    let rooms = Dataset::open(&collection.out).unwrap();
+    for episode in rooms.episodes() {
+        let dir = dir.path().join(episode.index.to_string());
+        fs::create_dir_all(&dir).unwrap();
+        let back = imported_from(&rooms, &[episode.frames()], &dir);
+        let fov = |camera: Option<CameraModel>| camera.unwrap().horizontal_fov_rad;
+        let difference = fov(back.info().camera) - fov(rooms.camera(episode.index));
+        assert!(difference.abs() < 1e-5, "{difference}");
+    }
+    // No camera model is true of both.
+    assert_eq!(exported_and_imported(&rooms, dir.path()).info().camera, None);
 }
 
 #[test]

@@ -31,7 +31,8 @@ async fn a_recording_on_the_server_becomes_a_data_set() {
         ..ServerConfig::default()
     };
     let app = app(&dir.path().join("data"), config);
-    let fields = json!({"size": "16x12", "resize": "letterbox", "skip_bad": true, "unit": ["state.heading=deg"]});
+    let fields = json!({"size": "16x12", "resize": "letterbox", "skip_bad": true, "unit": ["state.heading=deg"],
+        "fov": 90.0, "tilt": 15.0, "camera_height": 0.2});
     let created = post(&app, JOBS, &job("walk", fields.clone())).await;
     assert_eq!(created.status, 202, "{}", created.json());
     let path = format!("{JOBS}/{}", created.json()["id"].as_str().unwrap());
@@ -121,6 +122,16 @@ async fn wrong_imports_are_refused_with_the_field() {
             "walk",
             json!({"hold": -1.0}),
             "hold: -1 is not valid; it must be 0 to 3600",
+        ),
+        (
+            "walk",
+            json!({"fov": 4.0}),
+            "fov: 4 is not valid; it must be 5 to 170 degrees",
+        ),
+        (
+            "walk",
+            json!({"camera_height": 20.0}),
+            "camera_height: 20 is not valid; it must be 0.01 to 10 metres",
         ),
         (
             "walk",

@@ -292,7 +292,7 @@ fn a_model_is_trained_and_scored_as_papers_do() {
     let figures = evaluation::draw_figures(&loaded, &other, &report).unwrap();
     assert!(figures.iter().any(|figure| figure.about.file == "prediction.gif"));
     let scores = report.scores("test").unwrap();
-    assert_eq!((scores.windows, scores.trials), (12, 12));
+    assert_eq!((scores.windows, scores.blocks), (12, Some(12)));
     for row in &scores.methods {
         let benchmark = row.benchmark.as_ref().unwrap();
         assert!((benchmark.squared_error.mean - 4096.0 * row.mse.mean).abs() < 1e-6);

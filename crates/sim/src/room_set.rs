@@ -33,6 +33,12 @@ impl RoomSet {
             Self::NewCameras => "new-cameras",
         }
     }
+
+    /// Whether no model may be trained in these rooms.
+    #[must_use]
+    pub fn is_only_for_tests(self) -> bool {
+        self != Self::Varied
+    }
 }
 
 impl fmt::Display for RoomSet {

@@ -62,6 +62,12 @@ impl Scenario {
     pub fn observer_drives(self) -> bool {
         self != Self::StaticObserver
     }
+
+    /// Whether Tb2 gets other goals after its first one, from anywhere to anywhere.
+    #[must_use]
+    pub fn has_several_goals(self) -> bool {
+        self != Self::StaticObserver
+    }
 }
 
 impl fmt::Display for Scenario {
@@ -247,7 +253,7 @@ impl TrialParameters {
     }
 
     /// Whether the trial must not be used for training, because of its start/goal pair or its heading gain. If Tb2 drives to
-    /// several goals, the first pair counts.
+    /// several goals, the first pair counts, though later ones may be pairs that are held out.
     #[must_use]
     pub fn is_held_out(&self) -> bool {
         self.has_held_out_pair() || HELD_OUT_HEADING_GAIN.contains(&self.gains.heading.proportional)

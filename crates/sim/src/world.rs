@@ -263,7 +263,7 @@ impl World {
         let period = self.config.frame_period_s as f32;
         let steps = (period / PHYSICS_STEP_S).ceil().max(1.0);
         let dt = period / steps;
-        let next_goals = self.parameters.scenario.observer_drives().then_some(&self.room);
+        let next_goals = self.parameters.scenario.has_several_goals().then_some(&self.room);
         let mut touched = false;
         for _ in 0..steps as usize {
             for (other, robot) in self.others.iter_mut().zip(1..) {

@@ -37,19 +37,22 @@ pub use self::progress::{EvaluationProgress, EvaluationStage};
 pub use self::report::EvaluationReport;
 
 use self::baselines::Baselines;
+use self::bootstrap::is_recording;
 use self::inference::Inference;
 use self::method::Method;
 use self::progress::EvaluationContext;
 use self::report::{ModelSummary, ReportStamp, SetOutcome, SetReport, SetScores};
 use self::windows::{evenly, window_shape};
 use foreframe_core::registry::Model;
-use foreframe_data::dataset::Dataset;
 use foreframe_data::dataset::moving_mnist::MOVING_MNIST;
 use foreframe_data::dataset::sampler::{Split, Splits};
+use foreframe_data::dataset::{Dataset, Window};
+use foreframe_sim::RoomSet;
 
 /// Scores the model on the splits that [`EvaluateConfig::split`] names: the validation split, the three test sets
-/// (trials, start/goal pairs and gains that training never saw), or the whole data set. Errors: model and data set that
-/// don't fit together, settings out of range, nothing held out, `TrainedOn`, `Cancelled`, those of the network.
+/// (trials, start/goal pairs and gains that training never saw), or the whole data set. Rooms that are only for tests are
+/// scored as a whole. Errors: model and data set that don't fit together, settings out of range, nothing held out,
+/// `TrainedOn`, `Cancelled`, those of the network.
 pub fn run(
     loaded: &Model,
     dataset: &Dataset,
@@ -65,6 +68,10 @@ pub fn run(
         compatible::check(twin, dataset)?;
         compatible::split_seed(twin, dataset, Some(split_seed))?;
     }
+    let config = &EvaluateConfig {
+        split: config.split.of(loaded, dataset),
+        ..config.clone()
+    };
     if config.split == ScoredSplit::WholeSet {
         compatible::check_untrained(loaded, dataset)?;
     }
@@ -87,8 +94,9 @@ pub fn run(
     for &split in tests {
         evaluation.split = split;
         let (outcome, novelty) = score_split(&evaluation, &splits, &baselines)?;
+        let rooms = config::test_rooms(dataset).filter(|_| config.split == ScoredSplit::WholeSet);
         sets.push(SetReport {
-            split: split.name().to_owned(),
+            split: rooms.map_or(split.name(), RoomSet::name).to_owned(),
             outcome,
         });
         // Other data sets are compared with the first set that was scored.
@@ -142,6 +150,20 @@ fn fitted_baselines(evaluation: &EvaluationContext, splits: &Splits) -> Result<B
     Ok(baselines)
 }
 
+/// Why a set is not scored, if it is not.
+fn why_skipped(dataset: &Dataset, split: Split, available: &[Window]) -> Option<&'static str> {
+    let mut trials = dataset.episodes().iter().filter_map(|episode| episode.trial.as_ref());
+    match split {
+        Split::UnseenPairs if trials.any(|trial| trial.scenario.has_several_goals()) => {
+            Some("robots drive on to other goals in this scenario, so that only the first start/goal pair is held out")
+        }
+        _ if !available.is_empty() => None,
+        Split::UnseenPairs => Some("the data set has no trials with held-out start/goal pairs"),
+        Split::UnseenGains => Some("the data set has no trials with held-out gains"),
+        _ => Some("the split has no trials; collect more"),
+    }
+}
+
 /// Scores one set; also gives the novelty of its windows, if the model is calibrated.
 fn score_split(
     evaluation: &EvaluationContext,
@@ -151,18 +173,13 @@ fn score_split(
     let (Inference { loaded, dataset }, config) = (evaluation.inference, evaluation.config);
     let (spec, bootstrap) = (loaded.spec(), config.bootstrap());
     let available = splits.windows(dataset, evaluation.split, window_shape(spec), config.stride)?;
-    if available.is_empty() {
-        let reason = match evaluation.split {
-            Split::UnseenPairs => "the data set has no trials with held-out start/goal pairs",
-            Split::UnseenGains => "the data set has no trials with held-out gains",
-            _ => "the split has no trials; collect more",
-        };
+    if let Some(reason) = why_skipped(dataset, evaluation.split, &available) {
         let reason = reason.to_owned();
         return Ok((SetOutcome::Skipped { reason }, Vec::new()));
     }
     let windows = evenly(&available, config.max_windows);
     let windows_scored = score::score(evaluation, &windows, baselines)?;
-    let mut scores = SetScores::new(baselines.methods(), &windows_scored, &bootstrap);
+    let mut scores = SetScores::new(baselines.methods(), &windows_scored, &bootstrap, is_recording(dataset));
     if baselines.are_of_benchmark() {
         metrics::add_benchmark(&mut scores.methods, &windows_scored, spec.pixels());
     }

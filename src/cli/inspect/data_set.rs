@@ -58,13 +58,18 @@ fn print_description(dir: &Path, info: &DatasetInfo) -> Result<(), CliError> {
 }
 
 fn camera(info: &DatasetInfo) -> String {
+    if info.world.as_ref().is_some_and(|world| world.rooms.is_some()) {
+        return "each trial has its own".to_owned();
+    }
     info.camera.map_or_else(
         || "not described".to_owned(),
         |camera| {
+            let height = camera.height_m;
             format!(
-                "pinhole, {:.1}° wide, tilted down {:.1}°",
+                "pinhole, {:.1}° wide, tilted down {:.1}°{}",
                 camera.horizontal_fov_rad.to_degrees(),
-                camera.tilt_down_rad.to_degrees()
+                camera.tilt_down_rad.to_degrees(),
+                height.map_or_else(String::new, |height_m| format!(", {height_m} m above the floor"))
             )
         },
     )

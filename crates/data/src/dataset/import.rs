@@ -5,6 +5,7 @@
 //! Only one shard is in memory at a time.
 
 mod bag;
+mod camera;
 mod donkeycar;
 mod error;
 mod files;
@@ -55,7 +56,8 @@ pub fn import(
     let recording = open(config, cancelled)?;
     check_channels(&recording)?;
     check_units(options, &recording)?;
-    let plan = timing::plan(recording, options)?;
+    let mut plan = timing::plan(recording, options)?;
+    camera::describe(&mut plan, options, cancelled)?;
     directory.write(&plan, on_progress, cancelled)
 }
 

@@ -99,7 +99,7 @@ pub struct ActionRow {
     pub variant: Variant,
     /// Mean squared error per pixel.
     pub mse: StepCurve,
-    /// 95 % bootstrap interval over trials of the mean MSE; absent with fewer than two trials.
+    /// 95 % bootstrap interval of the mean MSE, over trials or blocks of time; absent with fewer than two.
     pub interval: Option<Interval>,
     /// 1 − MSE(true) / MSE(this): the share of this error that the true actions remove.
     pub reduction: f64,

@@ -10,10 +10,13 @@ use foreframe_data::dataset::{Dataset, Window};
 /// Length of a recording's block, in windows.
 const BLOCK_WINDOWS: usize = 5;
 
+/// Intervals from fewer trials or blocks than these are too narrow to be trusted.
+pub(super) const FEWEST_GROUPS: usize = 10;
+
 /// Share of the resampled values that an [`Interval`] holds.
 pub(super) const CONFIDENCE: f64 = 0.95;
 
-/// The range of the middle 95 % of the values computed from resampled trials.
+/// The range of the middle 95 % of the values computed from resampled trials or blocks of time.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Interval {
     /// Lower end.
@@ -28,6 +31,11 @@ impl Interval {
     pub fn is_below(&self, other: &Self) -> bool {
         self.high < other.low
     }
+}
+
+/// Whether windows are resampled in blocks of time: the episodes are no trials.
+pub(super) fn is_recording(dataset: &Dataset) -> bool {
+    dataset.episodes().iter().all(|episode| episode.trial.is_none())
 }
 
 /// What a window is resampled with, windows having this number of frames: its trial, or in a recording the block of frames in

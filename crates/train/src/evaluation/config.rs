@@ -10,6 +10,7 @@ use foreframe_core::registry::Model;
 use foreframe_core::types::Seed;
 use foreframe_data::dataset::Dataset;
 use foreframe_data::dataset::sampler::{Split, Splits};
+use foreframe_sim::RoomSet;
 
 /// What a model is scored on.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -20,7 +21,8 @@ pub enum ScoredSplit {
     /// To publish: the three held-out test sets. Choosing by them would make their scores too good.
     #[default]
     Test,
-    /// To publish: all of a data set that holds nothing but test data, as the files of published benchmarks do.
+    /// To publish: all of a data set that holds nothing but test data, as the files of published benchmarks and rooms that
+    /// are only for tests do.
     WholeSet,
 }
 
@@ -35,6 +37,16 @@ impl ScoredSplit {
         }
     }
 
+    /// What is scored where this is asked for: all of a data set whose rooms are only for tests, unless the model was
+    /// trained in them.
+    pub(super) fn of(self, loaded: &Model, dataset: &Dataset) -> Self {
+        let was_seen = loaded.manifest.dataset.content_hash == dataset.info().content_hash;
+        match self {
+            Self::Test if test_rooms(dataset).is_some() && !was_seen => Self::WholeSet,
+            split => split,
+        }
+    }
+
     /// How the data set is split for it.
     pub(super) fn divide(self, dataset: &Dataset, seed: Seed) -> Splits {
         match self {
@@ -42,6 +54,12 @@ impl ScoredSplit {
             Self::Validation | Self::Test => Splits::new(dataset, seed),
         }
     }
+}
+
+/// The rooms of the data set, if they are only for tests.
+pub(super) fn test_rooms(dataset: &Dataset) -> Option<RoomSet> {
+    let world = dataset.info().world.as_ref()?;
+    world.rooms.filter(|rooms| rooms.is_only_for_tests())
 }
 
 /// Training windows among which the baseline looks for the nearest ones at most, unless another number is asked for: all of
@@ -57,7 +75,7 @@ pub struct EvaluateConfig<'a> {
     pub split_seed: Option<Seed>,
     /// Frames from the start of one window to that of the next.
     pub stride: usize,
-    /// Windows of each set at most, evenly spread over its trials.
+    /// Windows of each set at most, evenly spread over its trials or blocks of time.
     pub max_windows: usize,
     /// Training windows among which the baseline looks for the nearest ones, at most, evenly spread.
     pub nearest_windows: usize,

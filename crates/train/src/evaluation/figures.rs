@@ -43,8 +43,8 @@ pub fn draw_figures(
 ) -> Result<Vec<Figure>, EvaluationError> {
     let inference = Inference { loaded, dataset };
     let (mut predictions, mut reconstructions, mut charts, mut animation) = (vec![], vec![], vec![], None);
-    for &split in report.stamp.split.splits() {
-        let Some(scores) = report.scores(split.name()) else {
+    for (&split, set) in report.stamp.split.splits().iter().zip(&report.sets) {
+        let Some(scores) = set.outcome.scores() else {
             continue;
         };
         let is_first = charts.is_empty();
@@ -61,7 +61,8 @@ pub fn draw_figures(
         if is_first {
             animation = animate(inference, report, split, scores)?;
         }
-        charts.push(draw_chart(split, scores)?);
+        let title = set_title(&set.split, scores.blocks.is_some());
+        charts.push(draw_chart(split, title, scores)?);
     }
     let figures = predictions.into_iter().chain(reconstructions).chain(charts);
     Ok(figures.chain(animation).collect())
@@ -106,7 +107,7 @@ fn draw_window(
     Ok((prediction, Some(reconstruction)))
 }
 
-fn draw_chart(split: Split, scores: &SetScores) -> Result<Figure, EvaluationError> {
+fn draw_chart(split: Split, title: &str, scores: &SetScores) -> Result<Figure, EvaluationError> {
     let file = match split {
         Split::Test | Split::Validation => "error-by-horizon.svg".to_owned(),
         other => format!("error-by-horizon-{other}.svg"),
@@ -116,7 +117,7 @@ fn draw_chart(split: Split, scores: &SetScores) -> Result<Figure, EvaluationErro
         file: file.clone(),
         reason: error.to_string(),
     })?;
-    let caption = format!("Error by horizon against the baselines: {}", set_title(split.name()));
+    let caption = format!("Error by horizon against the baselines: {title}");
     Ok(Figure::new(file, caption, svg.into_bytes()))
 }
 

@@ -4,7 +4,7 @@ use minijinja::value::ViaDeserialize;
 use minijinja::{Environment, Value, context};
 
 use super::actions::Variant;
-use super::bootstrap::CONFIDENCE;
+use super::bootstrap::{CONFIDENCE, FEWEST_GROUPS};
 use super::method::Method;
 use super::metrics::PSNR_CAP_DB;
 use super::report::EvaluationReport;
@@ -26,7 +26,12 @@ impl EvaluationReport {
         environment.add_filter("method", |method: ViaDeserialize<Method>| method.label());
         environment.add_filter("variant", |variant: ViaDeserialize<Variant>| variant.label());
         let report = Value::from_serialize(self);
-        let context = context! { psnr_cap_db => PSNR_CAP_DB, confidence => CONFIDENCE, ..report };
+        let context = context! {
+            psnr_cap_db => PSNR_CAP_DB,
+            confidence => CONFIDENCE,
+            fewest_groups => FEWEST_GROUPS,
+            ..report
+        };
         environment
             .render_str(include_str!("report.md.jinja"), context)
             .expect("a report that does not fit its template is a bug")
@@ -34,11 +39,14 @@ impl EvaluationReport {
 }
 
 /// What a set holds, as a heading.
-pub(super) fn set_title(split: &str) -> &'static str {
+pub(super) fn set_title(split: &str, is_recording: bool) -> &'static str {
     match split {
         "validation" => "Validation",
         "unseen-pairs" => "Unseen start/goal pairs",
         "unseen-gains" => "Unseen gains",
+        "new-materials" => "New materials",
+        "new-cameras" => "New cameras",
+        _ if is_recording => "Test part",
         _ => "Unseen trials",
     }
 }

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value, json};
 
 use super::actions::ActionTable;
-use super::bootstrap::{Bootstrap, TrialSums};
+use super::bootstrap::{Bootstrap, FEWEST_GROUPS, TrialSums};
 use super::config::ScoredSplit;
 use super::method::Method;
 use super::metrics::{MethodScores, StepCurve, WindowScores, summarize};
@@ -67,10 +67,14 @@ impl EvaluationReport {
                 "mover_mse": model.mover_mse.as_ref().map(|mse| mse.mean),
                 "plan_identification": plan_rate,
                 "band_90_coverage": scores.uncertainty.as_ref().map(|scores| scores.coverage.mean),
+                "skill_interval_is_reliable": scores.intervals_are_reliable,
                 "windows": scores.windows,
-                "trials": scores.trials,
                 "dataset_content_hash": self.stamp.dataset_content_hash,
             });
+            match scores.blocks {
+                Some(blocks) => summary["blocks"] = json!(blocks),
+                None => summary["trials"] = json!(scores.trials),
+            }
             if let Some(benchmark) = &model.benchmark {
                 summary["squared_error_per_frame"] = json!(benchmark.squared_error.mean);
                 summary["ssim_even_windows"] = json!(benchmark.ssim.mean);
@@ -213,7 +217,8 @@ pub struct NearestSummary {
 /// One test set.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct SetReport {
-    /// `test`, `unseen-pairs`, `unseen-gains` or `validation`.
+    /// `test`, `unseen-pairs`, `unseen-gains` or `validation`; `new-materials` or `new-cameras` for rooms that are only for
+    /// tests.
     pub split: String,
     /// Its scores, or why there are none.
     #[serde(flatten)]
@@ -251,8 +256,14 @@ pub struct SetScores {
     pub windows: usize,
     /// Windows available at that stride.
     pub windows_available: usize,
-    /// Trials that they come from; in a recording, blocks of time.
-    pub trials: usize,
+    /// Trials that they come from; absent for a recording.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub trials: Option<usize>,
+    /// Blocks of time that they come from, for a recording.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub blocks: Option<usize>,
+    /// Whether the intervals can be trusted: they are from at least ten trials or blocks.
+    pub intervals_are_reliable: bool,
     /// The headline.
     pub skill: Skill,
     /// Model, baselines and codec.
@@ -276,14 +287,17 @@ pub struct SetScores {
 
 impl SetScores {
     /// The scores of these windows, whose rows are the methods. What else a set may have is filled in later.
-    pub(super) fn new(methods: &[Method], windows: &[WindowScores], bootstrap: &Bootstrap) -> Self {
+    pub(super) fn new(methods: &[Method], windows: &[WindowScores], bootstrap: &Bootstrap, is_recording: bool) -> Self {
         let trial_of: Vec<usize> = windows.iter().map(|window| window.group).collect();
         let by_trial = |of: fn(&WindowScores) -> &[f64]| TrialSums::group(&trial_of, windows.iter().map(of));
         let own_space = by_trial(|window| &window.model_space_mse);
+        let groups = own_space.count();
         Self {
             windows: windows.len(),
             windows_available: windows.len(),
-            trials: own_space.count(),
+            trials: (!is_recording).then_some(groups),
+            blocks: is_recording.then_some(groups),
+            intervals_are_reliable: groups >= FEWEST_GROUPS,
             skill: skill(methods, windows, bootstrap),
             methods: summarize(methods, windows),
             model_space_mse: StepCurve::new(own_space.means()),

@@ -12,9 +12,9 @@ use super::metrics::{StepCurve, WindowScores};
 pub struct Skill {
     /// At each step ahead, and their mean.
     pub skill: StepCurve,
-    /// 95 % bootstrap interval at each step; empty with fewer than two trials.
+    /// 95 % bootstrap interval at each step; empty with fewer than two trials or blocks of time.
     pub per_step_interval: Vec<Interval>,
-    /// 95 % bootstrap interval of the mean; absent with fewer than two trials.
+    /// 95 % bootstrap interval of the mean; absent with fewer than two trials or blocks of time.
     pub mean_interval: Option<Interval>,
     /// The strongest baseline at each step.
     pub best_baseline: Vec<Method>,

@@ -115,7 +115,8 @@ impl Augmentation {
         seed: Seed,
     ) -> Result<Self, TrainError> {
         let info = dataset.info();
-        if config.crop > 0.0 && info.camera.is_some() {
+        let mut episodes = dataset.episodes().iter();
+        if config.crop > 0.0 && episodes.any(|episode| dataset.camera(episode.index).is_some()) {
             return Err(TrainError::Config(format!(
                 "data.crop is {}; it must be 0 for a data set with a camera model, which a part of the frame does not fit",
                 config.crop

@@ -8,11 +8,12 @@ use super::cdr::CdrWriter;
 use super::mcap::McapWriter;
 use crate::dataset::store::files::write_whole;
 use crate::dataset::{Dataset, DatasetError};
+use foreframe_core::frame::warp::CameraModel;
 use foreframe_core::types::Channel;
 
 /// The topic of the images.
 pub const IMAGE_TOPIC: &str = "/camera/image_raw";
-/// Beside the images, if the data set has a camera model.
+/// Beside the images of episodes whose camera is known.
 const CAMERA_TOPIC: &str = "/camera/camera_info";
 /// The topic of the actions, if there are any.
 pub const ACTION_TOPIC: &str = "/action";
@@ -49,10 +50,11 @@ type FrameValues = fn(&Dataset, usize) -> &[f32];
 fn write(dataset: &Dataset, episodes: &[Range<usize>], mut bag: McapWriter<'_>) -> Result<(), DatasetError> {
     let info = dataset.info();
     let image = bag.topic(IMAGE_TOPIC, "sensor_msgs/msg/Image", &image_definition());
-    let camera = info.camera.map(|camera| {
-        let topic = bag.topic(CAMERA_TOPIC, "sensor_msgs/msg/CameraInfo", &camera_definition());
-        (topic, camera.horizontal_fov_rad)
-    });
+    let cameras: Vec<Option<CameraModel>> = episodes.iter().map(|frames| camera_of(dataset, frames)).collect();
+    let camera_topic = cameras
+        .iter()
+        .any(Option::is_some)
+        .then(|| bag.topic(CAMERA_TOPIC, "sensor_msgs/msg/CameraInfo", &camera_definition()));
     let frames = || episodes.iter().cloned().flatten();
     let mut values = Vec::new();
     for (name, channels, of_frame) in [
@@ -75,14 +77,14 @@ fn write(dataset: &Dataset, episodes: &[Range<usize>], mut bag: McapWriter<'_>) 
     let size = (info.frame_width_px, info.frame_height_px);
     let period_ns = info.frame_period_s * 1e9;
     let mut start_ns = START_NS;
-    for episode in episodes {
+    for (episode, camera) in episodes.iter().zip(cameras) {
         for (place, frame) in episode.clone().enumerate() {
             let time_ns = start_ns + (place as f64 * period_ns).round() as u64;
             for (topic, kind, row) in &values {
                 bag.message(*topic, time_ns, &kind.message(time_ns, &row(frame)))?;
             }
-            if let Some((topic, fov_rad)) = camera {
-                bag.message(topic, time_ns, &camera_info(time_ns, size, fov_rad))?;
+            if let (Some(topic), Some(camera)) = (camera_topic, camera) {
+                bag.message(topic, time_ns, &camera_info(time_ns, size, camera.horizontal_fov_rad))?;
             }
             bag.message(image, time_ns, &gray_image(time_ns, size, &dataset.pixels(frame)?))?;
         }
@@ -91,6 +93,14 @@ fn write(dataset: &Dataset, episodes: &[Range<usize>], mut bag: McapWriter<'_>) 
         start_ns = (start_ns + duration_ns + gap_ns).next_multiple_of(1_000_000_000);
     }
     bag.finish()
+}
+
+/// The camera of the episode with these frames.
+fn camera_of(dataset: &Dataset, frames: &Range<usize>) -> Option<CameraModel> {
+    let begun = dataset
+        .episodes()
+        .partition_point(|episode| episode.first_frame <= frames.start);
+    dataset.camera(begun.checked_sub(1)?)
 }
 
 /// The message that holds an action or a state.

@@ -71,6 +71,22 @@ pub struct ImportOptions {
     /// For how long the last action and state of a bag hold
     #[cfg_attr(feature = "cli", arg(long = "hold", value_name = "SECONDS", default_value_t = 1.0))]
     pub hold_s: f64,
+    /// The angle between the left and the right edge of the recorded images, 5 to 170 degrees [default: known from some bags]
+    #[cfg_attr(feature = "cli", arg(long = "fov", value_name = "DEGREES"))]
+    // Absent options are not written, so that imports begun by earlier versions of the program go on.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub fov_deg: Option<f64>,
+    /// How far the camera looks down from the horizontal, -85 to 85 degrees [default: 0, if the field of view is known]
+    #[cfg_attr(
+        feature = "cli",
+        arg(long = "tilt", value_name = "DEGREES", allow_negative_numbers = true)
+    )]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub tilt_deg: Option<f64>,
+    /// Height of the camera above the floor, 0.01 to 10 metres
+    #[cfg_attr(feature = "cli", arg(long = "camera-height", value_name = "METRES"))]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub camera_height_m: Option<f64>,
     /// Leave out what is damaged and list it, instead of stopping there
     #[cfg_attr(feature = "cli", arg(long))]
     pub skip_bad: bool,
@@ -91,6 +107,9 @@ impl Default for ImportOptions {
             states: Vec::new(),
             units: Vec::new(),
             hold_s: 1.0,
+            fov_deg: None,
+            tilt_deg: None,
+            camera_height_m: None,
             skip_bad: false,
         }
     }
@@ -110,30 +129,37 @@ impl ImportOptions {
         let (width, height) = (self.frame_width_px, self.frame_height_px);
         let sides = 1..=MAX_SIDE_PX;
         let bad_unit = self.units.iter().find(|unit| !unit.contains('='));
-        let (option, value, right) = if !(1..=MAX_EVERY).contains(&self.every) {
-            ("every", self.every.to_string(), format!("it must be 1 to {MAX_EVERY}"))
-        } else if let Some(rate) = self.rate_hz.filter(|rate| !(0.01..=1000.0).contains(rate)) {
-            (
-                "rate",
-                rate.to_string(),
-                "it must be 0.01 to 1000 frames per second".to_owned(),
-            )
-        } else if !(0.0..=3600.0).contains(&self.hold_s) {
-            (
-                "hold",
-                self.hold_s.to_string(),
-                "it must be 0 to 3600 seconds".to_owned(),
-            )
-        } else if !sides.contains(&width) || !sides.contains(&height) {
+        let wrong = |option, value, right| Err(ImportError::OptionValue { option, value, right });
+        if !(1..=MAX_EVERY).contains(&self.every) {
+            return wrong("every", self.every.to_string(), format!("it must be 1 to {MAX_EVERY}"));
+        }
+        for (option, value, range, unit) in [
+            ("rate", self.rate_hz, 0.01..=1000.0, "frames per second"),
+            ("hold", Some(self.hold_s), 0.0..=3600.0, "seconds"),
+            ("fov", self.fov_deg, 5.0..=170.0, "degrees"),
+            ("tilt", self.tilt_deg, -85.0..=85.0, "degrees"),
+            ("camera-height", self.camera_height_m, 0.01..=10.0, "metres"),
+        ] {
+            if let Some(value) = value.filter(|value| !range.contains(value)) {
+                let right = format!("it must be {} to {} {unit}", range.start(), range.end());
+                return wrong(option, value.to_string(), right);
+            }
+        }
+        if !sides.contains(&width) || !sides.contains(&height) {
             let right = format!("each side must be 1 to {MAX_SIDE_PX} px");
-            ("size", format!("{width}x{height}"), right)
-        } else if let Some(unit) = bad_unit {
+            return wrong("size", format!("{width}x{height}"), right);
+        }
+        bad_unit.map_or(Ok(()), |unit| {
             let given = format!("\"{}\"", unit.escape_default());
-            ("unit", given, "write NAME=UNIT, as in speed=m/s".to_owned())
-        } else {
-            return Ok(());
-        };
-        Err(ImportError::OptionValue { option, value, right })
+            wrong("unit", given, "write NAME=UNIT, as in speed=m/s".to_owned())
+        })
+    }
+
+    /// Whether they say something of the camera.
+    pub(super) fn describes_camera(&self) -> bool {
+        [self.fov_deg, self.tilt_deg, self.camera_height_m]
+            .iter()
+            .any(Option::is_some)
     }
 
     /// A channel with the unit that `--unit NAME=UNIT` gives it, or else with that of the source.

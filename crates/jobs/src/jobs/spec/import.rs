@@ -69,6 +69,18 @@ pub struct ImportSpec {
     #[serde(default = "default_hold")]
     #[schema(default = 1.0, minimum = 0, maximum = 3600)]
     pub hold: f64,
+    /// The angle between the left and the right edge of the recorded images, 5 to 170 degrees; by default, known from some bags.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schema(minimum = 5, maximum = 170)]
+    pub fov: Option<f64>,
+    /// How far the camera looks down from the horizontal, -85 to 85 degrees; by default 0, if the field of view is known.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schema(minimum = -85, maximum = 85)]
+    pub tilt: Option<f64>,
+    /// Height of the camera above the floor, 0.01 to 10 metres.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schema(minimum = 0.01, maximum = 10)]
+    pub camera_height: Option<f64>,
     /// Leaves out what is damaged and lists it in the job's log, instead of stopping there.
     #[serde(default)]
     pub skip_bad: bool,
@@ -152,11 +164,21 @@ impl ImportSpec {
             states: self.state.clone(),
             units: self.unit.clone(),
             hold_s: self.hold,
+            fov_deg: self.fov,
+            tilt_deg: self.tilt,
+            camera_height_m: self.camera_height,
             skip_bad: self.skip_bad,
         };
         match options.validate() {
             Ok(()) => Ok(options),
-            Err(ImportError::OptionValue { option, value, right }) => Err(wrong(option, &value, &right)),
+            Err(ImportError::OptionValue { option, value, right }) => {
+                let field = if option == "camera-height" {
+                    "camera_height"
+                } else {
+                    option
+                };
+                Err(wrong(field, &value, &right))
+            }
             Err(other) => Err(JobError::invalid("source", other.to_string())),
         }
     }

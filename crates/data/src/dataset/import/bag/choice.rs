@@ -208,12 +208,15 @@ impl<'a> Choice<'a> {
         })
     }
 
-    /// What the camera's `camera_info` says: the one beside the image's topic.
+    /// What the camera's `camera_info` says, the one beside the image's topic; none where it changes.
     fn projection(&self, image: &str) -> Option<&'a Projection> {
         self.topics.iter().find_map(|topic| match &topic.content {
-            Content::Camera(found) => {
+            Content::Camera(different) => {
                 let folder = topic.name.strip_suffix("camera_info")?;
-                found.as_ref().filter(|_| image.starts_with(folder))
+                match &different[..] {
+                    [projection] if image.starts_with(folder) => Some(projection),
+                    _ => None,
+                }
             }
             _ => None,
         })

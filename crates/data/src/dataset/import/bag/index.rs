@@ -128,7 +128,8 @@ impl ValueStream {
 pub(super) enum Content {
     Images(Vec<MessageEntry>),
     Values(ValueStream),
-    Camera(Option<Projection>),
+    /// The different descriptions of the camera, of which two are enough.
+    Camera(Vec<Projection>),
     Unused,
 }
 
@@ -154,9 +155,13 @@ impl Topic {
     fn take(&mut self, mut entry: MessageEntry, message: &[u8]) -> Result<(), String> {
         let header_time = |stamp: i64| Some(stamp).filter(|&stamp| stamp != 0);
         match &mut self.content {
-            // Cameras seldom change; the first description counts.
-            Content::Unused | Content::Camera(Some(_)) => {}
-            Content::Camera(found) => *found = Some(messages::camera_info(message)?),
+            Content::Unused => {}
+            Content::Camera(different) => {
+                let projection = messages::camera_info(message)?;
+                if different.len() < 2 && !different.contains(&projection) {
+                    different.push(projection);
+                }
+            }
             Content::Images(images) => {
                 let stamp = if self.kind == RosType::Image {
                     let (stamp, image) = messages::image(message)?;
@@ -276,7 +281,7 @@ impl<'a> BagIndex<'a> {
         if encoding != "cdr" {
             Content::Unused
         } else if kind == RosType::CameraInfo {
-            Content::Camera(None)
+            Content::Camera(Vec::new())
         } else if kind.is_image() && image.as_ref().is_none_or(|image| image == name) {
             Content::Images(Vec::new())
         } else if (is_command || is_measurement)
