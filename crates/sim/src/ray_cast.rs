@@ -84,7 +84,10 @@ pub(super) enum Solid {
 
 impl Solid {
     /// Where the ray enters the solid, until `max_time`.
-    #[expect(clippy::inline_always, reason = "without it a picture of a crowded room takes a sixth longer")]
+    #[expect(
+        clippy::inline_always,
+        reason = "without it a picture of a crowded room takes a sixth longer"
+    )]
     #[inline(always)]
     pub(super) fn cast(&self, ray: &Ray, max_time: f32) -> Option<RayIntersection> {
         match self {
