@@ -81,6 +81,7 @@ impl<'a> RobotView<'a> {
     }
 
     /// Casts the ray against the robot. Overwrites `hit` if the robot is nearer.
+    #[inline]
     pub(super) fn cast(&self, direction: Vector, hit: &mut NearestHit) {
         let along = self.to_center.dot(direction);
         if along * along < direction.length_squared() * self.outside {
