@@ -24,7 +24,7 @@ pub(super) struct Neighbour {
 
 /// A training window that may be near: no pixels were compared yet.
 #[derive(Clone, Copy)]
-struct Candidate {
+struct CandidateWindow {
     place: usize,
     /// The distance is not less than this.
     bound: f64,
@@ -134,7 +134,7 @@ impl TrainingWindows {
         pixels: &[Vec<u8>],
         actions: &[&[f32]],
         action_weight: f64,
-    ) -> Vec<Candidate> {
+    ) -> Vec<CandidateWindow> {
         let values = self.images.values();
         let mut wanted = vec![0.0; pixels.len() * values];
         for (small, frame) in wanted.chunks_exact_mut(values).zip(pixels) {
@@ -150,7 +150,7 @@ impl TrainingWindows {
             };
             // A little room for rounding.
             let of_images = (0.999 * f64::from(squared_distance(small, &wanted)) - 1.0).max(0.0);
-            Candidate {
+            CandidateWindow {
                 place,
                 bound: of_images + of_actions,
                 of_actions,
@@ -176,7 +176,7 @@ impl TrainingWindows {
         &self,
         dataset: &Dataset,
         pixels: &[Vec<u8>],
-        mut candidates: Vec<Candidate>,
+        mut candidates: Vec<CandidateWindow>,
         nearest: &mut Vec<Neighbour>,
     ) -> Result<(), EvaluationError> {
         candidates.sort_by(|one, other| one.bound.total_cmp(&other.bound));
