@@ -43,7 +43,7 @@ function DataSet({ dataset, models, parameters }) {
     <p><a href="#data">‹ all data sets</a></p>
     <h1>${dataset.name}</h1>
     <div class="choice"><label>Episode <input type="number" min="0" max=${dataset.episodes - 1} value=${number} onChange=${event => move(event.target.value)} /></label>
-      <span>of ${dataset.episodes}</span><button class="small" disabled=${number === 0} onClick=${() => move(number - 1)}>previous</button>
+      <span class="of">of ${dataset.episodes}</span><button class="small" disabled=${number === 0} onClick=${() => move(number - 1)}>previous</button>
       <button class="small" disabled=${number >= dataset.episodes - 1} onClick=${() => move(number + 1)}>next</button></div>
     <${Episode} key=${`${dataset.name} ${number}`} dataset=${dataset} number=${number} models=${models} parameters=${parameters} />
     <details onToggle=${event => setShows(event.target.open)}><summary>Inspection: what to look at before training</summary>
@@ -58,7 +58,7 @@ function NewData() {
   const [wrong, setWrong] = useState("");
   const submit = spec => call("POST", "/v1/jobs", spec).then(job => { setJob(job.id); setWrong(""); }, error => setWrong(error.message));
   return html`<h2>New data set</h2>
-    <div class="columns"><${Collect} submit=${submit} /><${Import} submit=${submit} /></div>
+    <div class="forms"><${Collect} submit=${submit} /><${Import} submit=${submit} /></div>
     <p class="wrong" role="alert">${wrong}</p>
     ${job_id && html`<${Follow} id=${job_id} />`}`;
 }
@@ -81,7 +81,7 @@ function Collect({ submit }) {
   const onSubmit = handler(({ name, scenario, trials, seed }) => submit({ kind: "collect", name, scenario, trials: +trials, seed: +seed }));
   return html`<form class="card" onSubmit=${onSubmit}><h3>Collect from the simulator</h3><div class="form">
     <label>Name <input name="name" required pattern="[a-z0-9][a-z0-9\\-]*" placeholder="first" /></label>
-    <label>Scenario <select name="scenario">${SCENARIOS.map(one => html`<option>${one}</option>`)}</select></label>
+    <label>Scenario <select name="scenario">${SCENARIOS.map(one => html`<option value=${one}>${one}</option>`)}</select></label>
     <label>Trials <input name="trials" type="number" min="1" max="1000000" value="50" /></label>
     <label>Seed <input name="seed" type="number" min="0" value="1" /></label>
     </div><div class="actions"><button class="main">Collect</button></div></form>`;
@@ -94,7 +94,7 @@ function Import({ submit }) {
   }));
   return html`<form class="card" onSubmit=${onSubmit}><h3>Import a recording</h3><div class="form">
     <label>Name <input name="name" required pattern="[a-z0-9][a-z0-9\\-]*" placeholder="mycar" /></label>
-    <label>Path below <code>import_dir</code> <input name="source" required placeholder="drive-1" /></label>
+    <label>Path in the import folder <input name="source" required placeholder="drive-1" /></label>
     <label>Size <input name="size" value="64x64" pattern="[0-9]{1,4}x[0-9]{1,4}" /></label>
     <label>Frames per second <input name="rate" type="number" step="any" min="0.01" placeholder="as recorded" /></label>
     <label>Actions <input name="action" placeholder="found by name" /></label>

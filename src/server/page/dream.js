@@ -7,11 +7,11 @@ import { heldAction, isManual, Pad } from "./keys.js";
 import { Picture } from "./picture.js";
 import { noteOf } from "./play.js";
 import { Plot } from "./plot.js";
+import { contextBody } from "./predict.js";
 import { useMoments } from "./robot.js";
 import { levels, NOVEL, noveltyClass, noveltyWord } from "./score.js";
-import { takesState } from "./server_lists.js";
+import { takesActions, takesState } from "./server_lists.js";
 import { Copy, curl, requests } from "./snippets.js";
-import { fromBytes } from "./base64.js";
 import { SIMULATOR_STATES } from "./sources.js";
 import { sendAll, Stream } from "./stream.js";
 
@@ -145,12 +145,10 @@ function Drift({ dream, period_s }) {
 
 // A prediction of three horizons from the present context: what a dream does, in one request.
 function body(robot) {
-  const { context, spec } = robot, last = context.at(-1);
+  const { context, spec, model } = robot, last = context.at(-1);
   const steps = 3 * spec.horizon;
   return {
-    frames: context.map(({ frame }) => fromBytes(frame.pixels)), format: "raw", steps,
-    ...(spec.conditioning.startsWith("state") && { state: last?.state }),
-    ...(spec.conditioning.endsWith("action") && { plan: Array(steps).fill(last?.action) }),
+    ...contextBody(model, context), steps, ...(takesActions(model) && { plan: Array(steps).fill(last?.action) }),
   };
 }
 

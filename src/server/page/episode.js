@@ -4,7 +4,7 @@ import { html, useEffect, useMemo, useRef, useState } from "./preact.js";
 import { go, note } from "./address.js";
 import { Picture } from "./picture.js";
 import { COLORS, Plot } from "./plot.js";
-import { compare, levels } from "./score.js";
+import { compare, levels, lookBack } from "./score.js";
 import { Copy, curl, requests } from "./snippets.js";
 import { readEpisode, whyNotDataset } from "./sources.js";
 import { Stream } from "./stream.js";
@@ -52,16 +52,15 @@ async function predictAll(model, { frames, actions, states }, tell, isGone) {
   const stream = await Stream.open(model.name);
   const history = [];
   try {
+    let answers = [];
     for (const [place, frame] of frames.entries()) {
       if (isGone()) return;
+      const plan = actions.slice(place, place + spec.horizon);
       const moment = { frame, action: actions[place], state: states[place], begins: place === 0 };
-      const answer = await stream.send(moment);
+      answers = [...answers, await stream.send({ ...moment, plan: plan.length === spec.horizon ? plan : undefined })].slice(-spec.horizon - 1);
       history.push(moment);
-      if (answer.type === "prediction") moment.prediction = answer;
-      Object.assign(moment, compare(history, spec));
-      // Only the last predicted frame is shown; its own turn has come.
-      const old = history[place - spec.horizon];
-      if (old) delete old.prediction;
+      const past = lookBack(history, spec);
+      if (past && answers[0].type === "prediction") Object.assign(moment, compare(frame, past.context, answers[0]));
       if (place % TOLD_EVERY === 0) tell([...history]);
     }
     tell([...history]);
@@ -87,7 +86,7 @@ export function Episode({ dataset, number, models, parameters }) {
         <div class=${model ? "two" : ""}>
           <${Picture} image=${frame} caption="recorded" label=${`frame ${at}`} />
           ${[[model, first], [other, second]].map(([one, moments]) => one && html`<${Picture} image=${moments[at]?.predicted ?? frame} dim=${!moments[at]?.predicted}
-            note=${moments[at]?.predicted ? "" : moments.length <= at ? "predicting" : "no prediction yet"} caption=${`predicted by ${one.name}`} label=${`what ${one.name} predicted for frame ${at}`} />`)}
+            note=${moments[at]?.predicted ? "" : moments.length <= at ? "predicting" : "no prediction yet"} caption=${one.name} label=${`what ${one.name} predicted for frame ${at}`} />`)}
           ${model && !other && html`<${Picture} image=${first[at]?.predicted && frame} other=${first[at]?.predicted} caption="the difference" label="the difference" />`}
         </div>
         <${Controls} player=${player} count=${data.frames.length} />
@@ -170,7 +169,7 @@ function Channels({ title, channels, rows, player }) {
     }));
   }, [rows, channels]);
   return channels.length > 0 && html`<h2>${title}</h2>${groups.map(({ unit, data, series }) => html`
-    <${Plot} label=${`${title}: ${series.map(({ label }) => label).join(", ")}`} data=${data} series=${series} height=${110} y=${unit} sync="episode" mark=${player.at} onPick=${player.jump} legend />`)}`;
+    <${Plot} label=${`${title}: ${series.map(({ label }) => label).join(", ")}`} data=${data} series=${series} height=${110} y=${unit || " "} sync="episode" mark=${player.at} onPick=${player.jump} legend />`)}`;
 }
 
 const CARD_FRAMES = 20;

@@ -1,6 +1,6 @@
 // Gray images: decoded, drawn and compared.
 
-import { toBytes } from "./base64.js";
+import { fromBytes, toBytes } from "./base64.js";
 
 // An image; pixels are bytes, row by row.
 export class Gray {
@@ -8,6 +8,9 @@ export class Gray {
     Object.assign(this, { width, height, pixels });
   }
 }
+
+// The pixels as base64; written once, since a frame is sent several times.
+export const raw = image => (image.base64 ??= fromBytes(image.pixels));
 
 const scratch = new OffscreenCanvas(1, 1);
 const scratchContext = scratch.getContext("2d", { willReadFrequently: true });

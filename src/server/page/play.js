@@ -27,7 +27,7 @@ export function Play({ robot }) {
     <div class="three">
       <${Picture} image=${now?.frame} dim=${robot.status === "reconnecting"} caption="the camera now" label="the camera now" note=${now ? "" : note} />
       ${mode === "beside" ? html`<${Picture} image=${compared?.predicted} dim=${is_old} note=${note || (is_old ? `first prediction due in ${ahead_s} s` : "")}
-          caption=${`predicted for now, ${ahead_s} s ago`} label=${`what was predicted for now, ${ahead_s} s ago`} />`
+          caption=${`predicted from ${ahead_s} s ago${takesActions(robot.model) ? " and the actions since" : ""}`} label=${`what was predicted for now, ${ahead_s} s ago`} />`
         : html`<${Mixed} image=${compared?.frame} other=${compared?.predicted} mode=${mode} at=${at} label="the camera and the prediction on one another"
           caption=${mode === "wipe" ? "left: camera, right: prediction" : "camera and prediction mixed"} />`}
       <${Picture} image=${compared?.frame} other=${compared?.predicted} dim=${is_old} caption="the difference" label="the difference between both"
@@ -40,7 +40,7 @@ export function Play({ robot }) {
       <span class="key"><i class="brighter" /> camera brighter <i class="darker" /> camera darker</span>
     </div>
     <${Verdict} robot=${robot} score=${score} />
-    <h2>From now to +${ahead_s} s</h2>
+    <h2>From now to +${ahead_s} s${takesActions(robot.model) ? ", if the action stays" : ""}</h2>
     <div class=${`strip ${robot.status === "running" ? "" : "dim"}`} style=${{ "--count": spec.horizon }}>
       ${Array.from({ length: spec.horizon }, (_, step) => html`<button class="enlarge" aria-label=${`predicted for +${label(spec, step)} s; enlarges`}>
         <${Picture} image=${predicted?.frames[step]} caption=${`+${label(spec, step)} s`} label="" note=${predicted ? "" : note} /></button>`)}

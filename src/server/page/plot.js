@@ -50,7 +50,8 @@ export function Plot({ label, data, series, height = 150, x = "", y = "", log, s
       made.destroy();
     };
   }, [kind, height]);
-  useEffect(() => plot.current?.setData(data), [data]);
-  useEffect(() => plot.current?.redraw(false), [mark]);
+  useEffect(() => plot.current.setData(data), [data]);
+  // Its first drawing comes by itself.
+  useEffect(() => { if (plot.current.status) plot.current.redraw(false); }, [mark]);
   return html`<div class=${`plot ${onPick ? "pickable" : ""}`} ref=${place} role="img" aria-label=${label} />`;
 }

@@ -4,7 +4,8 @@ import { useEffect, useState } from "./preact.js";
 import { isLocked } from "./server_lists.js";
 import { pause } from "./api.js";
 import { heldAction, isManual } from "./keys.js";
-import { compare } from "./score.js";
+import { predict } from "./predict.js";
+import { compare, lookBack } from "./score.js";
 import { openSource } from "./sources.js";
 import { sendAll, Stream } from "./stream.js";
 
@@ -103,8 +104,8 @@ export class Robot {
     // A stream has the context of one episode.
     if (moment.begins || !this.stream || this.stream.socket.readyState !== WebSocket.OPEN) await this.openStream();
     moment.action = this.nextAction(moment);
-    const [answer, next] = await Promise.all([this.stream.send(moment), this.source.step(moment.action), this.beside(moment)]);
-    this.receive(moment, answer);
+    const [answer, next, comparison] = await Promise.all([this.stream.send(moment), this.source.step(moment.action), this.compare(moment), this.beside(moment)]);
+    this.receive(Object.assign(moment, comparison), answer);
     this.now = next;
     this.tell();
     const period_ms = (1000 * this.spec.frame_period_s) / this.speed;
@@ -118,11 +119,16 @@ export class Robot {
     if (!this.now.begins) await sendAll(this.stream, this.context.slice(1 - this.spec.context));
   }
 
+  // How the moment compares with what the model predicts for it from the frames up to `horizon` ago and the actions since.
+  async compare(moment) {
+    const past = lookBack([...this.history, moment], this.spec);
+    return past && compare(moment.frame, past.context, await predict(this.model, past.context, past.plan));
+  }
+
   receive(moment, answer) {
     moment.at_s = performance.now() / 1000;
     if (answer.type === "prediction") moment.prediction = answer;
     this.history.push(moment);
-    Object.assign(moment, compare(this.history, this.spec));
     this.status = answer.type === "prediction" ? "running" : "collecting";
     this.have = answer.have ?? this.spec.context;
     this.error = "";

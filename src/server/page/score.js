@@ -12,19 +12,22 @@ export const RAISED = 0.9;
 
 export const levels = error => 255 * Math.sqrt(error);
 
-// Compares a moment with what was predicted for it `horizon` frames ago, if its context reaches back so far. `history` ends with it.
-export function compare(history, { horizon, context }) {
-  const now = history.at(-1), then = history.at(-1 - horizon);
-  const since = history.slice(-horizon);
-  if (!then?.prediction || since.some(({ begins }) => begins)) return {};
-  const predicted = then.prediction.frames[horizon - 1];
-  const seen = history.slice(-horizon - context, -horizon).map(({ frame }) => frame);
+// The context of `horizon` frames ago and the actions since, if they are of one episode; null otherwise.
+export function lookBack(moments, { horizon, context }) {
+  const all = moments.slice(-horizon - context);
+  if (all.length < horizon + context || all.slice(1).some(({ begins }) => begins)) return null;
+  return { context: all.slice(0, context), plan: all.slice(context - 1, -1).map(({ action }) => action) };
+}
+
+// Compares the last moment with what was predicted for it from the context of `horizon` frames ago.
+export function compare(frame, seen, { frames, expected_mse, mse_band_90 }) {
+  const predicted = frames.at(-1), images = seen.map(moment => moment.frame);
   return {
     predicted,
-    error: mse(predicted, now.frame),
-    guess_error: Math.min(mse(then.frame, now.frame), mse(mean(seen), now.frame)),
-    expected: then.prediction.expected_mse?.[horizon - 1],
-    band: then.prediction.mse_band_90?.[horizon - 1],
+    error: mse(predicted, frame),
+    guess_error: Math.min(mse(images.at(-1), frame), mse(mean(images), frame)),
+    expected: expected_mse?.at(-1),
+    band: mse_band_90?.at(-1),
   };
 }
 

@@ -1,8 +1,8 @@
 // A stream of a model over a WebSocket: frames go in, predicted frames come out. See /asyncapi.yaml.
 
 import { keyProtocols } from "./api.js";
-import { fromBytes, toBytes } from "./base64.js";
-import { Gray } from "./gray.js";
+import { toBytes } from "./base64.js";
+import { Gray, raw } from "./gray.js";
 
 export class Stream {
   // Resolves when the server is ready for the first frame.
@@ -42,15 +42,15 @@ export class Stream {
   }
 
   // Sends a frame with what the model takes besides. Resolves to the answer, its frames decoded.
-  async send({ frame, action, state, steps }) {
+  async send({ frame, action, state, plan, steps }) {
     const { conditioning } = this.ready.spec;
     const message = { type: "frame", seq: this.seq++, timestamp_us: Math.round(performance.now() * 1000), format: "raw", steps };
-    if (conditioning.endsWith("action")) message.action = action;
+    if (conditioning.endsWith("action")) Object.assign(message, { action, plan });
     if (conditioning.startsWith("state")) message.state = state;
     if (this.socket.readyState !== WebSocket.OPEN) throw new Error("the stream is closed");
     const answer = await new Promise((resolve, reject) => {
       this.waiting.set(message.seq, { resolve, reject });
-      this.socket.send(JSON.stringify({ ...message, image: fromBytes(frame.pixels) }));
+      this.socket.send(JSON.stringify({ ...message, image: raw(frame) }));
     });
     const decode = text => new Gray(frame.width, frame.height, toBytes(text));
     return { ...answer, frames: answer.frames?.map(decode) };

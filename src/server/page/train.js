@@ -25,7 +25,7 @@ function Trainings({ models, datasets, jobs, parameters }) {
   if (!datasets) return html`<p class="quiet wait">Loading…</p>`;
   const chosen = parameters.job ?? jobs.find(({ spec }) => spec.kind === "train")?.id;
   return html`
-    ${datasets.length ? html`<div class="columns"><${NewTraining} datasets=${datasets} jobs=${jobs} submit=${submit} /><${NewEvaluation} models=${models} datasets=${datasets} submit=${submit} /></div>`
+    ${datasets.length ? html`<div class="forms"><${NewTraining} datasets=${datasets} jobs=${jobs} submit=${submit} /><${NewEvaluation} models=${models} datasets=${datasets} submit=${submit} /></div>`
       : html`<div class="empty"><h2>First a data set</h2><p><a href="#data">Collect or import one</a>; then train on it here.</p></div>`}
     <p class="wrong" role="alert">${wrong}</p>
     ${jobs.length > 0 && html`<h2>Jobs</h2><${Jobs} jobs=${jobs} chosen=${chosen} />`}
@@ -80,8 +80,8 @@ function NewTraining({ datasets, jobs, submit }) {
     : form.steps ? `About ${duration(pace_s * form.steps)}, from the last training of this preset here.`
     : `The last training of this preset here took ${(1000 * pace_s).toFixed(0)} ms a step.`;
   return html`<form class="card" onSubmit=${event => { event.preventDefault(); submit(spec); }}><h3>New training</h3><div class="form">
-      <label>Data set <select value=${dataset.name} onChange=${set("dataset")}>${datasets.map(({ name }) => html`<option>${name}</option>`)}</select></label>
-      <label>Preset <select value=${preset} onChange=${set("preset")}>${(presets.length ? presets : [preset]).map(name => html`<option>${name}</option>`)}</select></label>
+      <label>Data set <select value=${dataset.name} onChange=${set("dataset")}>${datasets.map(({ name }) => html`<option value=${name}>${name}</option>`)}</select></label>
+      <label>Preset <select value=${preset} onChange=${set("preset")}>${(presets.length ? presets : [preset]).map(name => html`<option value=${name}>${name}</option>`)}</select></label>
       <label>Name of the model <input value=${form.name} placeholder=${dataset.name} pattern="[a-z0-9][a-z0-9\\-]*" onInput=${set("name")} /></label>
       <label>Steps <input type="number" min="1" value=${form.steps} placeholder="of the preset" onInput=${set("steps")} /></label>
       <label class="wide">Other settings, one a line <textarea rows="2" value=${form.settings} placeholder="sequence.batch_size=16" onInput=${set("settings")} /></label>
@@ -96,8 +96,8 @@ function NewEvaluation({ models, datasets, submit }) {
   const spec = { kind: "evaluate", model, dataset };
   const set = name => event => setForm({ ...form, [name]: event.target.value });
   return models.length > 0 && html`<form class="card" onSubmit=${event => { event.preventDefault(); submit(spec); }}><h3>New evaluation</h3><div class="form">
-      <label>Model <select value=${model} onChange=${set("model")}>${models.map(({ name }) => html`<option>${name}</option>`)}</select></label>
-      <label>Data set <select value=${dataset} onChange=${set("dataset")}>${datasets.map(({ name }) => html`<option>${name}</option>`)}</select></label>
+      <label>Model <select value=${model} onChange=${set("model")}>${models.map(({ name }) => html`<option value=${name}>${name}</option>`)}</select></label>
+      <label>Data set <select value=${dataset} onChange=${set("dataset")}>${datasets.map(({ name }) => html`<option value=${name}>${name}</option>`)}</select></label>
     </div><p class="quiet">Compares the model with simple guesses on trials that training did not use, and writes a report.</p>
     <div class="actions"><button class="main">Evaluate</button><${Copy} curl=${() => curl("POST", "/v1/jobs", spec)} python=${() => requests("POST", "/v1/jobs", spec)} /></div></form>`;
 }

@@ -2,14 +2,14 @@
 
 import { html, useEffect, useRef, useState } from "./preact.js";
 import { call } from "./api.js";
-import { fromBytes, toBytes } from "./base64.js";
-import { Gray, mse } from "./gray.js";
+import { mse } from "./gray.js";
 import { actionFor } from "./keys.js";
 import { Picture } from "./picture.js";
 import { noteOf } from "./play.js";
 import { useMoments } from "./robot.js";
+import { contextBody, decode } from "./predict.js";
 import { levels } from "./score.js";
-import { takesActions, takesState } from "./server_lists.js";
+import { takesActions } from "./server_lists.js";
 import { Copy, curl, requests } from "./snippets.js";
 
 // Name, how much ahead, how much left, color.
@@ -27,8 +27,7 @@ function present(robot) {
 
 function requestFor(robot, context) {
   const plans = PLANS.map(([, ahead, left]) => Array(robot.spec.horizon).fill(actionFor(robot.spec.actions, ahead, left)));
-  const state = takesState(robot.model) ? { state: context.at(-1).state } : {};
-  return { frames: context.map(({ frame }) => fromBytes(frame.pixels)), format: "raw", plans, ...state };
+  return { ...contextBody(robot.model, context), plans };
 }
 
 const path = robot => `/v1/models/${robot.model.name}/rollouts`;
@@ -36,10 +35,9 @@ const path = robot => `/v1/models/${robot.model.name}/rollouts`;
 async function compareAll(robot, context) {
   const request = requestFor(robot, context);
   const answer = await call("POST", path(robot), request);
-  const { width, height } = context.at(-1).frame;
   return PLANS.map(([name, ahead, left, color], place) => ({
     name, ahead, left, color, actions: request.plans[place],
-    frames: answer.rollouts[place].map(frame => new Gray(width, height, toBytes(frame))),
+    frames: decode(answer.rollouts[place], robot.spec),
     expected: answer.expected_mse?.[place]?.at(-1),
   }));
 }
@@ -83,7 +81,7 @@ export function WhatIf({ robot }) {
     <div class="overview">
       <${Picture} image=${frame} caption="the present frame" label="the present frame" note=${frame ? "" : note} dim=${robot.status === "reconnecting"} />
       <${Picture} image=${goal} caption="the goal: a picture to reach" label="the goal" note=${goal ? "" : note} />
-      <figure class="picture"><figcaption>the ways, seen from above</figcaption><${Map} robot=${robot} plans=${plans} best=${best} /></figure>
+      <figure class="picture"><figcaption>the ways, seen from above</figcaption><${Ways} robot=${robot} plans=${plans} best=${best} /></figure>
     </div>
     <div class="toolbar">
       <button onClick=${() => setGoal(frame)} disabled=${!frame}>make the present frame the goal</button>
@@ -129,7 +127,7 @@ function Ways({ robot, plans, best }) {
 }
 
 function drawMap(canvas, robot, plans, best) {
-  const context = canvas.getContext("2d"), scale = canvas.width / 2.6, middle = [canvas.width / 2, canvas.height * 0.62];
+  const context = canvas.getContext("2d"), scale = canvas.width / 2, middle = [canvas.width / 2, canvas.height * 0.75];
   const color = name => getComputedStyle(canvas).getPropertyValue(name).trim();
   // x ahead and y left of the robot, in metres.
   const at = (x, y) => [middle[0] - y * scale, middle[1] - x * scale];

@@ -25,7 +25,7 @@ macro_rules! page_files {
     };
 }
 
-const PAGE_FILES: [(&str, &str); 27] = page_files![
+const PAGE_FILES: [(&str, &str); 28] = page_files![
     "address.js",
     "api.js",
     "app.js",
@@ -42,6 +42,7 @@ const PAGE_FILES: [(&str, &str); 27] = page_files![
     "play.js",
     "plot.js",
     "preact.js",
+    "predict.js",
     "robot.js",
     "score.js",
     "server_lists.js",
