@@ -72,7 +72,9 @@ async function predictAll(model, { frames, actions, states }, tell, isGone) {
 export function Episode({ dataset, number, models, parameters }) {
   const { data, wrong } = useEpisode(dataset.name, number);
   const fitting = models.filter(model => !whyNotDataset(model, dataset));
-  const [model, other] = [parameters.model, parameters.other].map(name => fitting.find(one => one.name === name));
+  // The best one, unless another or none was chosen.
+  const model = parameters.model === undefined ? fitting[0] : fitting.find(({ name }) => name === parameters.model);
+  const other = fitting.find(({ name }) => name === parameters.other);
   const [first, second] = [usePredictions(model, data), usePredictions(other, data)];
   const player = usePlayer(data, dataset.frame_period_s, +(parameters.frame ?? 0));
   if (wrong) return html`<p class="wrong" role="alert">${wrong}</p>`;
@@ -138,8 +140,8 @@ function Controls({ player, count }) {
 
 function Choice({ models, model, other, dataset, number }) {
   if (!models.length) return html`<p class="quiet">No model fits this data set: frame size, rate, channels and camera have to match.</p>`;
-  const select = (label, value, name, words) => html`<label>${label} <select value=${value?.name ?? ""} onChange=${event => note({ [name]: event.target.value })}>
-    <option value="">${words}</option>${models.map(one => html`<option value=${one.name}>${one.name}</option>`)}</select></label>`;
+  const select = (label, value, name, words) => html`<label>${label} <select value=${value?.name ?? "none"} onChange=${event => note({ [name]: event.target.value })}>
+    <option value="none">${words}</option>${models.map(one => html`<option value=${one.name}>${one.name}</option>`)}</select></label>`;
   return html`<div class="choice">${select("Model", model, "model", "none")}${model && select("compare with", other, "other", "nothing")}
     ${model && html`<button class="small" onClick=${() => go("play", { model: model.name, source: `set:${dataset.name}`, episode: number })}>play this episode live</button>`}</div>`;
 }

@@ -88,9 +88,11 @@ export function Embedded({ path, label }) {
     setState("drawing…");
     text(path).then(page => {
       if (is_gone) return;
-      const parsed = new DOMParser().parseFromString(page, "text/html");
+      // Style elements in the text would break this page's security policy.
+      const styles = [...page.matchAll(/<style>(.*?)<\/style>/gs)].map(([, rules]) => sheet(rules));
+      const parsed = new DOMParser().parseFromString(page.replaceAll(/<style>.*?<\/style>/gs, ""), "text/html");
       const root = place.current.shadowRoot ?? place.current.attachShadow({ mode: "open" });
-      root.adoptedStyleSheets = [...parsed.querySelectorAll("style")].map(({ textContent }) => sheet(textContent));
+      root.adoptedStyleSheets = styles;
       const body = Object.assign(document.createElement("div"), { className: "body" });
       body.append(...parsed.body.childNodes);
       root.replaceChildren(body);
@@ -101,9 +103,9 @@ export function Embedded({ path, label }) {
   return html`<div>${state && html`<p class="quiet">${state}</p>`}<div ref=${place} role="region" aria-label=${label} /></div>`;
 }
 
-function sheet(styles) {
+function sheet(rules) {
   const made = new CSSStyleSheet();
-  made.replaceSync(`${styles.replaceAll(":root", ":host").replaceAll(/(^|[\s,}])body(?=[\s,{])/g, "$1.body")} .body { max-width: none; margin: 0; padding: 0; }`);
+  made.replaceSync(`${rules.replaceAll(":root", ":host").replaceAll(/(^|[\s,}])body(?=[\s,{])/g, "$1.body")} .body { max-width: none; margin: 0; padding: 0; }`);
   return made;
 }
 

@@ -4,10 +4,13 @@ import { html, useMemo, useState } from "./preact.js";
 import { drivesAgainIn_s, isManual, letItDrive, Pad } from "./keys.js";
 import { Mixed, Picture } from "./picture.js";
 import { Plot } from "./plot.js";
+import { contextBody } from "./predict.js";
 import { useMoments } from "./robot.js";
 import { levels, NOVEL, novelty, noveltyClass, noveltyWord, share } from "./score.js";
 import { takesActions } from "./server_lists.js";
-import { Copy, curl, streamInPython } from "./snippets.js";
+import { Copy, curl, requests, streamInPython } from "./snippets.js";
+
+const SPEEDS = [1, 2, 6];
 
 export function Play({ robot }) {
   useMoments(robot);
@@ -37,22 +40,31 @@ export function Play({ robot }) {
       <span role="group" aria-label="Compare">${[["beside", "side by side"], ["overlay", "overlay"], ["wipe", "wipe"]].map(([name, words]) =>
         html`<button class="small" aria-pressed=${mode === name} onClick=${() => setMode(name)}>${words}</button>`)}</span>
       ${mode !== "beside" && html`<input type="range" min="0" max="100" value=${at} aria-label="how much of the prediction" onInput=${event => setAt(+event.target.value)} />`}
+      <label class="quiet">Speed <select class="small" value=${robot.speed} onChange=${event => { robot.speed = +event.target.value; }}>
+        ${SPEEDS.map(speed => html`<option value=${speed}>${speed}×, ${Math.round(speed / spec.frame_period_s)} frames/s</option>`)}</select></label>
       <span class="key"><i class="brighter" /> camera brighter <i class="darker" /> camera darker</span>
     </div>
     <${Verdict} robot=${robot} score=${score} />
     <h2>From now to +${ahead_s} s${takesActions(robot.model) ? ", if the action stays" : ""}</h2>
     <div class=${`strip ${robot.status === "running" ? "" : "dim"}`} style=${{ "--count": spec.horizon }}>
       ${Array.from({ length: spec.horizon }, (_, step) => html`<button class="enlarge" aria-label=${`predicted for +${label(spec, step)} s; enlarges`}>
-        <${Picture} image=${predicted?.frames[step]} caption=${`+${label(spec, step)} s`} label="" note=${predicted ? "" : note} /></button>`)}
+        <${Picture} image=${predicted?.frames[step]} caption=${`+${label(spec, step)} s`} label=${`+${label(spec, step)} s`} note=${predicted ? "" : note} /></button>`)}
     </div>
     <div class="columns">
       <${Errors} history=${history} />
       <${Driving} robot=${robot} />
     </div>
-    <footer><${Copy} python=${() => streamInPython(robot.model.name, robot.model.lineage.scenario ?? "moving-observer")}
+    <footer><${Copy} python=${() => program(robot)}
       curl=${() => curl("GET", `/v1/models/${robot.model.name}/preview.png`, undefined, " -o preview.png")} />
       <a href="/docs">API</a></footer>
   </section>`;
+}
+
+// A stream from the simulator; for a recording, one prediction of its present frames.
+function program({ model, source_id, context }) {
+  if (source_id === "simulator") return streamInPython(model.name, model.lineage.scenario);
+  const actions = takesActions(model) ? { actions: context.map(({ action }) => action) } : {};
+  return requests("POST", `/v1/models/${model.name}/predict`, { ...contextBody(model, context), ...actions });
 }
 
 const label = (spec, step) => ((step + 1) * spec.frame_period_s).toFixed(1);
