@@ -21,7 +21,7 @@ function Overview({ datasets, missing }) {
     ${missing && html`<p class="wrong">There is no data set “${missing}”.</p>`}
     ${!datasets.length && html`<div class="empty"><h2>None yet</h2><p>Collect one from the simulator, or import a recording. It appears here when the job is done.</p></div>`}
     <div class="cards">${datasets.map(dataset => html`<a class="card" key=${dataset.name} href=${link("data", { set: dataset.name })}>
-      <${Moving} dataset=${dataset} /><h3>${dataset.name}</h3><${Facts} dataset=${dataset} /></a>`)}</div>
+      <${Moving} dataset=${dataset} /><h2>${dataset.name}</h2><${Facts} dataset=${dataset} /></a>`)}</div>
     <${NewData} />
     <footer><${Copy} curl=${() => curl("GET", "/v1/datasets")} python=${() => requests("GET", "/v1/datasets")} /></footer>
   </section>`;

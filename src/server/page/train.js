@@ -79,7 +79,7 @@ function NewTraining({ datasets, jobs, submit }) {
   const estimate = !pace_s ? "No training of this preset has finished here yet, so its time is not known; the job tells it after its first steps."
     : form.steps ? `About ${duration(pace_s * form.steps)}, from the last training of this preset here.`
     : `The last training of this preset here took ${(1000 * pace_s).toFixed(0)} ms a step.`;
-  return html`<form class="card" onSubmit=${event => { event.preventDefault(); submit(spec); }}><h3>New training</h3><div class="form">
+  return html`<form class="card" onSubmit=${event => { event.preventDefault(); submit(spec); }}><h2>New training</h2><div class="form">
       <label>Data set <select value=${dataset.name} onChange=${set("dataset")}>${datasets.map(({ name }) => html`<option value=${name}>${name}</option>`)}</select></label>
       <label>Preset <select value=${preset} onChange=${set("preset")}>${(presets.length ? presets : [preset]).map(name => html`<option value=${name}>${name}</option>`)}</select></label>
       <label>Name of the model <input value=${form.name} placeholder=${dataset.name} pattern="[a-z0-9][a-z0-9\\-]*" onInput=${set("name")} /></label>
@@ -95,7 +95,7 @@ function NewEvaluation({ models, datasets, submit }) {
   const dataset = form.dataset ?? datasets[0].name;
   const spec = { kind: "evaluate", model, dataset };
   const set = name => event => setForm({ ...form, [name]: event.target.value });
-  return models.length > 0 && html`<form class="card" onSubmit=${event => { event.preventDefault(); submit(spec); }}><h3>New evaluation</h3><div class="form">
+  return models.length > 0 && html`<form class="card" onSubmit=${event => { event.preventDefault(); submit(spec); }}><h2>New evaluation</h2><div class="form">
       <label>Model <select value=${model} onChange=${set("model")}>${models.map(({ name }) => html`<option value=${name}>${name}</option>`)}</select></label>
       <label>Data set <select value=${dataset} onChange=${set("dataset")}>${datasets.map(({ name }) => html`<option value=${name}>${name}</option>`)}</select></label>
     </div><p class="quiet">Compares the model with simple guesses on trials that training did not use, and writes a report.</p>

@@ -80,8 +80,8 @@ export function WhatIf({ robot }) {
     <h1 class="visually-hidden">What if</h1>
     <div class="overview">
       <${Picture} image=${frame} caption="the present frame" label="the present frame" note=${frame ? "" : note} dim=${robot.status === "reconnecting"} />
-      <${Picture} image=${goal} caption="the goal: a picture to reach" label="the goal" note=${goal ? "" : note} />
-      <figure class="picture"><figcaption>the ways, seen from above</figcaption><${Ways} robot=${robot} plans=${plans} best=${best} /></figure>
+      <${Picture} image=${goal} caption="the goal" label="the goal" note=${goal ? "" : note} />
+      <figure class="picture"><figcaption>from above</figcaption><${Ways} robot=${robot} plans=${plans} best=${best} /></figure>
     </div>
     <div class="toolbar">
       <button onClick=${() => setGoal(frame)} disabled=${!frame}>make the present frame the goal</button>
@@ -91,12 +91,12 @@ export function WhatIf({ robot }) {
     </div>
     <p class="wrong" role="alert">${wrong}</p>
     <h2>What the next ${(robot.spec.horizon * robot.spec.frame_period_s).toFixed(1)} s would look like</h2>
-    <p class="quiet">The cost is the difference between the last predicted frame and the goal, in gray levels. The cheapest plan is outlined. Click one, and the robot takes it.</p>
+    <p class="quiet">The cost is the difference between the last predicted frame and the goal, in gray levels, ± the error to expect. The cheapest plan is outlined. Click one, and the robot takes it.</p>
     <div class=${`plans ${is_moving ? "dim" : ""}`}>${(plans.length ? plans : PLANS.map(([name, , , color]) => ({ name, color, frames: [] }))).map((plan, place) => html`
       <button class=${`plan ${place === best && plans.length ? "best" : ""}`} disabled=${!plans.length || is_moving || !robot.is_drivable} onClick=${() => take(plan)}>
         <h3><i style=${{ background: `var(${plan.color})` }} />${plan.name}</h3>
         <${Picture} image=${plan.frames[step] ?? frame} label=${`predicted for ${plan.name}`} note=${plans.length ? "" : note} />
-        <p>${plans.length ? html`cost <b>${levels(costs[place]).toFixed(1)}</b>${plan.expected === undefined ? "" : `, ± ${levels(plan.expected).toFixed(1)} expected`}` : "…"}</p>
+        <p>${plans.length ? html`cost <b>${levels(costs[place]).toFixed(1)}</b>${plan.expected === undefined ? "" : ` ± ${levels(plan.expected).toFixed(1)}`}` : "…"}</p>
       </button>`)}</div>
     <footer><${Copy} curl=${() => curl("POST", path(robot), requestFor(robot, robot.context), " -H 'Accept: image/gif' -o plans.gif")}
       python=${() => requests("POST", path(robot), requestFor(robot, robot.context), "for rollout in answer.json()[\"rollouts\"]:\n    print(len(rollout), \"frames\")")} /></footer>
