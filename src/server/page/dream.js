@@ -118,7 +118,7 @@ export function Dream({ robot }) {
       <div>
         <p class="imagined" role="status">${imagined_s.toFixed(1)} s imagined</p>
         <p><button class="main" onClick=${toggle} disabled=${!dream && robot.status !== "running"}>${dream ? "Open the camera again" : "Cut the camera"} <kbd>Space</kbd></button>
-        ${" "}<button onClick=${() => save(dream, robot)} disabled=${!dream || dream.moments.length < 2}>Save GIF</button></p>
+        ${" "}<button onClick=${event => { save(dream, robot); letSpaceCut(event); }} disabled=${!dream || dream.moments.length < 2}>Save GIF</button></p>
         <div class="meter"><p>Novelty ${last?.novelty === undefined ? "" : html`<b class=${shade}>${noveltyWord(last.novelty)}</b>`}</p>
           <div class="bar" role="img" aria-label=${`novelty ${last?.novelty?.toFixed(2) ?? "unknown"}`}><span class=${shade} style=${{ width: `${100 * (last?.novelty ?? 0)}%` }} /></div>
           <p class="ends"><span>like the training data</span><span>unlike it</span></p></div>
@@ -150,6 +150,11 @@ function body(robot) {
   return {
     ...contextBody(model, context), steps, ...(takesActions(model) && { plan: Array(steps).fill(last?.action) }),
   };
+}
+
+// After a click with the pointer, the space bar is for the camera again.
+function letSpaceCut({ detail, currentTarget }) {
+  if (detail) currentTarget.blur();
 }
 
 const SCALE = 3;

@@ -155,7 +155,7 @@ function ErrorLane({ moments, models, player }) {
   }, [count, ...moments]);
   const series = [{ label: "simple guess", color: "--quiet", dash: [4, 4], width: 1 }, ...models.filter(Boolean).map(({ name }, place) => ({ label: name, color: ["--orange", "--violet"][place], width: 2 }))];
   const worst = data[2].reduce((found, value, at) => (value > (data[2][found] ?? -1) ? at : found), 0);
-  return html`<h2>Error of the prediction <button class="small" onClick=${() => player.jump(worst)}>jump to the worst</button></h2>
+  return html`<h2>Error of the prediction <button class="small" disabled=${data[2][worst] == null} onClick=${() => player.jump(worst)}>jump to the worst</button></h2>
     <${Plot} label="error of the prediction for each frame" data=${data} series=${series} height=${130} y="gray levels" sync="episode" mark=${player.at} onPick=${player.jump} legend />`;
 }
 
