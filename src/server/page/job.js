@@ -86,7 +86,7 @@ export function Embedded({ path, label }) {
   useEffect(() => {
     let is_gone = false;
     setState("drawing…");
-    text(path).then(page => {
+    patiently(path).then(page => {
       if (is_gone) return;
       // Style elements in the text would break this page's security policy.
       const styles = [...page.matchAll(/<style>(.*?)<\/style>/gs)].map(([, rules]) => sheet(rules));
@@ -101,6 +101,19 @@ export function Embedded({ path, label }) {
     return () => { is_gone = true; };
   }, [path]);
   return html`<div>${state && html`<p class="quiet">${state}</p>`}<div ref=${place} role="region" aria-label=${label} /></div>`;
+}
+
+const TRIES = 10;
+
+// The server draws on after the request's deadline, and keeps the page: the next request gets it.
+async function patiently(path) {
+  for (let tries = 1; ; tries++) {
+    try {
+      return await text(path);
+    } catch (error) {
+      if (error.status !== 408 || tries === TRIES) throw error;
+    }
+  }
 }
 
 function sheet(rules) {
