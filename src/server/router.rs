@@ -17,8 +17,8 @@ use super::http::problem::ApiError;
 use super::http::requests;
 use super::openapi;
 use super::routes::{
-    audit, datasets, environments, episodes, events, health, job_events, jobs, metrics, models, pages, predict, preview,
-    rollouts, sessions, streams,
+    audit, datasets, environments, episodes, events, health, job_events, jobs, metrics, models, pages, predict,
+    preview, rollouts, sessions, streams,
 };
 use super::state::App;
 

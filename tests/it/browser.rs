@@ -161,7 +161,8 @@ impl Page {
 }
 
 /// True if a prediction has come true, so that all pictures are there.
-const IS_COMPLETE: &str = "/Error .* of the best simple guess|Nothing moves/.test(document.querySelector('.verdict')?.textContent)
+const IS_COMPLETE: &str =
+    "/Error .* of the best simple guess|Nothing moves/.test(document.querySelector('.verdict')?.textContent)
     && document.querySelectorAll('.play .picture.dim').length === 0";
 
 async fn serve(data_dir: &Path) -> (App, Keys, InProcessServer) {
@@ -195,7 +196,10 @@ async fn the_page_asks_for_an_api_key_and_hides_it() {
     let says = |text: &str| format!("document.querySelector('.unlock .wrong').textContent.includes('{text}')");
     page.wait_until("document.querySelector('.unlock') !== null && document.querySelector('.play') === null")
         .await;
-    assert_eq!(page.value("document.querySelector('.unlock .wrong').textContent").await, "");
+    assert_eq!(
+        page.value("document.querySelector('.unlock .wrong').textContent").await,
+        ""
+    );
     page.unlock("let me in").await;
     page.wait_until(&says("This is not a key")).await;
     page.unlock(&format!("{}x", key.text)).await;

@@ -338,7 +338,12 @@ async fn data_sets_are_described_shown_and_deleted() {
     assert_eq!(limits, "limit is 301; it must be 1 to 300");
     let page = get(&app, "/v1/datasets/seen/inspection").await;
     assert!(String::from_utf8(page.body).unwrap().contains("Contact sheet"));
-    assert!(page.headers["content-security-policy"].to_str().unwrap().starts_with("default-src 'none'"));
+    assert!(
+        page.headers["content-security-policy"]
+            .to_str()
+            .unwrap()
+            .starts_with("default-src 'none'")
+    );
 
     let mut long = train("slow", 100_000);
     long["settings"]["run"] = json!({});

@@ -22,8 +22,9 @@ export async function fromPng(base64) {
   if (scratch.width < width || scratch.height < height) Object.assign(scratch, { width, height });
   scratchContext.drawImage(image, 0, 0);
   image.close();
-  const { data } = scratchContext.getImageData(0, 0, width, height);
-  return new Gray(width, height, Uint8Array.from({ length: width * height }, (_, index) => data[4 * index]));
+  const { data } = scratchContext.getImageData(0, 0, width, height), pixels = new Uint8Array(width * height);
+  for (let index = 0; index < pixels.length; index++) pixels[index] = data[4 * index];
+  return new Gray(width, height, pixels);
 }
 
 // The mean squared difference; intensities 0 to 1.
@@ -35,11 +36,9 @@ export function mse(one, other) {
 
 export function mean(images) {
   const [{ width, height }] = images;
-  const pixels = new Uint8Array(width * height);
-  for (let index = 0; index < pixels.length; index++) {
-    pixels[index] = images.reduce((sum, image) => sum + image.pixels[index], 0) / images.length;
-  }
-  return new Gray(width, height, pixels);
+  const sums = new Float32Array(width * height);
+  for (const { pixels } of images) for (let index = 0; index < sums.length; index++) sums[index] += pixels[index];
+  return new Gray(width, height, Uint8Array.from(sums.map(sum => sum / images.length)));
 }
 
 // Draws an image, or with `other` the difference to it: orange where the first is brighter, blue where it is darker.

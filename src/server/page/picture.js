@@ -1,16 +1,15 @@
 // Pictures: canvases that keep the last image until the next one, so that none is ever empty or broken.
 
-import { html, useEffect, useRef } from "./preact.js";
+import { html, useLayoutEffect, useRef } from "./preact.js";
 import { draw } from "./gray.js";
 
 // `image`, or its difference to `other`. Without an image, the last one stays and is dimmed. `note` is shown over it.
 export function Picture({ image, other, label, caption, note, dim, className = "" }) {
   const canvas = useRef();
-  const drawn = useRef(false);
-  useEffect(() => {
+  // Before the browser paints, so that all of a moment is painted at once.
+  useLayoutEffect(() => {
     if (!image) return;
     draw(canvas.current, image, other);
-    drawn.current = true;
   }, [image, other]);
   const shape = image ? { aspectRatio: `${image.width} / ${image.height}` } : {};
   return html`<figure class=${`picture ${className} ${dim || !image ? "dim" : ""} ${other ? "difference" : ""}`}>
@@ -23,7 +22,7 @@ export function Picture({ image, other, label, caption, note, dim, className = "
 // Two images on one another: mixed, or the first to the left of a line and the second to the right.
 export function Mixed({ image, other, mode, at, caption, label }) {
   const [below, above] = [useRef(), useRef()];
-  useEffect(() => {
+  useLayoutEffect(() => {
     if (image) draw(below.current, image);
     if (other) draw(above.current, other);
   }, [image, other]);

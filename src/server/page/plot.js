@@ -1,6 +1,6 @@
 // Charts by uPlot, in the colors of the page, as wide as their place.
 
-import { html, useEffect, useRef } from "./preact.js";
+import { html, useLayoutEffect, useRef } from "./preact.js";
 import uPlot from "./uplot.js";
 
 const color = name => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
@@ -25,7 +25,7 @@ export function Plot({ label, data, series, height = 150, x = "", y = "", log, s
   pick.current = onPick;
   marked.current = mark;
   const kind = JSON.stringify([series, log, bands, sync, x, y]);
-  useEffect(() => {
+  useLayoutEffect(() => {
     const line = ({ label: name, color: shade, dash, width = 1.5, fill, points = false }) => ({
       label: name, stroke: () => color(shade), dash, width, fill: fill && (() => `${color(shade)}33`), points: { show: points }, spanGaps: true,
     });
@@ -50,8 +50,8 @@ export function Plot({ label, data, series, height = 150, x = "", y = "", log, s
       made.destroy();
     };
   }, [kind, height]);
-  useEffect(() => plot.current.setData(data), [data]);
+  useLayoutEffect(() => plot.current.setData(data), [data]);
   // Its first drawing comes by itself.
-  useEffect(() => { if (plot.current.status) plot.current.redraw(false); }, [mark]);
+  useLayoutEffect(() => { if (plot.current.status) plot.current.redraw(false); }, [mark]);
   return html`<div class=${`plot ${onPick ? "pickable" : ""}`} ref=${place} role="img" aria-label=${label} />`;
 }

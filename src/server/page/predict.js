@@ -15,9 +15,9 @@ export function contextBody(model, context) {
 
 export const decode = (frames, { frame_width_px, frame_height_px }) => frames.map(frame => new Gray(frame_width_px, frame_height_px, toBytes(frame)));
 
-// What the model predicts from the context if these actions follow.
-export async function predict(model, context, plan) {
+// The last frame that the model predicts from the context if these actions follow, and its errors to expect.
+export async function predictLast(model, context, plan) {
   const body = { ...contextBody(model, context), ...(takesActions(model) && { plan }) };
   const answer = await call("POST", `/v1/models/${model.name}/predict`, body);
-  return { ...answer, frames: decode(answer.frames, model.spec) };
+  return { ...answer, frames: decode(answer.frames.slice(-1), model.spec) };
 }

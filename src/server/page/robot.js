@@ -4,7 +4,7 @@ import { useEffect, useState } from "./preact.js";
 import { isLocked } from "./server_lists.js";
 import { pause } from "./api.js";
 import { heldAction, isManual } from "./keys.js";
-import { predict } from "./predict.js";
+import { predictLast } from "./predict.js";
 import { compare, lookBack } from "./score.js";
 import { openSource } from "./sources.js";
 import { sendAll, Stream } from "./stream.js";
@@ -122,7 +122,7 @@ export class Robot {
   // How the moment compares with what the model predicts for it from the frames up to `horizon` ago and the actions since.
   async compare(moment) {
     const past = lookBack([...this.history, moment], this.spec);
-    return past && compare(moment.frame, past.context, await predict(this.model, past.context, past.plan));
+    return past && compare(moment.frame, past.context, await predictLast(this.model, past.context, past.plan));
   }
 
   receive(moment, answer) {

@@ -18,8 +18,8 @@ use crate::server::state::App;
 use foreframe_core::nn::spec::MAX_MODEL_SIDE_PX;
 use foreframe_core::types::{Action, Channel, Seed};
 use foreframe_sim::{
-    Environment, Observation, PlanarPose, Scenario, SimError, StepResult, TrialParameters, World, WorldConfig, action_channels,
-    state_channels,
+    Environment, Observation, PlanarPose, Scenario, SimError, StepResult, TrialParameters, World, WorldConfig,
+    action_channels, state_channels,
 };
 
 pub(in crate::server) fn routes() -> OpenApiRouter<App> {

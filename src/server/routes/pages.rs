@@ -71,7 +71,11 @@ pub(in crate::server) fn routes() -> OpenApiRouter<App> {
         .routes(routes!(openapi_json))
         .routes(routes!(asyncapi_yaml));
     PAGE_FILES.into_iter().fold(pages, |pages, (path, text)| {
-        let media_type = if path.ends_with(".css") { "text/css" } else { "text/javascript" };
+        let media_type = if path.ends_with(".css") {
+            "text/css"
+        } else {
+            "text/javascript"
+        };
         let headers = [(header::CONTENT_TYPE, format!("{media_type}; charset=utf-8"))];
         pages.route(path, get(async move || (headers, text)))
     })
