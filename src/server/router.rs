@@ -17,8 +17,8 @@ use super::http::problem::ApiError;
 use super::http::requests;
 use super::openapi;
 use super::routes::{
-    audit, datasets, environments, health, job_events, jobs, metrics, models, pages, predict, preview, rollouts,
-    sessions, streams,
+    audit, datasets, environments, episodes, events, health, job_events, jobs, metrics, models, pages, predict,
+    preview, rollouts, sessions, streams,
 };
 use super::state::App;
 
@@ -76,6 +76,7 @@ fn request_routes(config: &ServerConfig) -> OpenApiRouter<App> {
         .merge(sessions::routes())
         .merge(jobs::routes(config.max_job_bytes))
         .merge(datasets::routes())
+        .merge(episodes::routes())
         .merge(environments::routes())
         .merge(audit::routes())
 }
@@ -85,4 +86,5 @@ fn stream_routes() -> OpenApiRouter<App> {
     OpenApiRouter::new()
         .merge(streams::routes())
         .merge(job_events::routes())
+        .merge(events::routes())
 }

@@ -3,6 +3,8 @@
 pub(super) mod audit;
 pub(super) mod datasets;
 pub(super) mod environments;
+pub(super) mod episodes;
+pub(super) mod events;
 pub(super) mod health;
 pub(super) mod job_events;
 pub(super) mod jobs;

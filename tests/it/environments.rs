@@ -7,7 +7,7 @@ use base64::engine::general_purpose::STANDARD;
 use foreframe::server::{App, ServerConfig};
 use foreframe_core::frame::codec;
 use foreframe_core::types::{Action, Seed};
-use foreframe_sim::{Environment, Scenario, TrialParameters, WorldConfig};
+use foreframe_sim::{Environment, PlanarPose, Scenario, TrialParameters, WorldConfig};
 use serde_json::{Value, json};
 
 use crate::service::{Answer, app, post, send};
@@ -47,6 +47,9 @@ async fn an_environment_returns_what_the_simulator_returns() {
         assert_eq!(pixels(&stepped["observation"]), expected.observation.frame.pixels());
         let state: Vec<f32> = serde_json::from_value(stepped["observation"]["state"].clone()).unwrap();
         assert_eq!(state, expected.observation.state.as_slice());
+        let poses: Vec<PlanarPose> = serde_json::from_value(stepped["info"]["poses"].clone()).unwrap();
+        let world = local.world().unwrap();
+        assert_eq!(poses, [vec![world.observer_pose()], world.other_robot_poses()].concat());
         assert_eq!(stepped["reward"].as_f64().unwrap() as f32, expected.reward);
     }
 }

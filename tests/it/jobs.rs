@@ -346,6 +346,21 @@ async fn open_job_events_do_not_delay_shutdown() {
 }
 
 #[tokio::test]
+async fn the_servers_events_announce_its_lists_and_its_stop() {
+    let dir = tempfile::tempdir().unwrap();
+    let (app, _finish) = scripted_app(dir.path(), true);
+    post(&app, JOBS, &collect("a")).await;
+    wait_for_state(&app, "job-1", "running").await;
+    let watched = app.clone();
+    let watcher = tokio::spawn(async move { get(&watched, "/v1/events").await });
+    run(app.clone()).await.stop().await;
+    let text = String::from_utf8(watcher.await.unwrap().body).unwrap();
+    let names: Vec<&str> = text.lines().filter_map(|line| line.strip_prefix("event: ")).collect();
+    assert_eq!(names[..2], ["models", "jobs"], "{text}");
+    assert_eq!(names.last(), Some(&"stopping"), "{text}");
+}
+
+#[tokio::test]
 async fn an_invalid_job_is_refused_at_submission() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());

@@ -24,7 +24,7 @@ const NAMES: [&str; 8] = [
     "datasets%2f..%2f..%2fmodels",
 ];
 
-const PATHS: [(&str, &str); 19] = [
+const PATHS: [(&str, &str); 21] = [
     ("GET", "/v1/models/NAME"),
     ("POST", "/v1/models/NAME/predict"),
     ("GET", "/v1/models/NAME/preview.png"),
@@ -43,6 +43,8 @@ const PATHS: [(&str, &str); 19] = [
     ("GET", "/v1/datasets/NAME"),
     ("DELETE", "/v1/datasets/NAME"),
     ("GET", "/v1/datasets/NAME/episodes/0/preview.png"),
+    ("GET", "/v1/datasets/NAME/episodes/0"),
+    ("GET", "/v1/datasets/NAME/inspection"),
     ("DELETE", "/v1/environments/NAME"),
 ];
 

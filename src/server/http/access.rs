@@ -16,7 +16,7 @@ pub(in crate::server) fn required_scope(method: &Method, route: &str) -> KeyScop
     let (resource, changes_versions) = (parts.next().unwrap_or_default(), route.contains("/versions/"));
     match resource {
         "models" if changes_versions => KeyScope::Admin,
-        "models" | "sessions" | "environments" => KeyScope::Predict,
+        "models" | "sessions" | "environments" | "events" => KeyScope::Predict,
         "datasets" if *method == Method::DELETE => KeyScope::Admin,
         "datasets" | "jobs" => KeyScope::Jobs,
         _ => KeyScope::Admin,
@@ -49,6 +49,7 @@ mod tests {
             (Method::GET, "/v1/models", KeyScope::Predict),
             (Method::POST, "/v1/models/{model}/predict", KeyScope::Predict),
             (Method::DELETE, "/v1/models/{model}/versions/{version}", KeyScope::Admin),
+            (Method::GET, "/v1/events", KeyScope::Predict),
             (Method::GET, "/v1/datasets", KeyScope::Jobs),
             (Method::DELETE, "/v1/datasets/{dataset}", KeyScope::Admin),
             (Method::POST, "/v1/jobs", KeyScope::Jobs),

@@ -12,6 +12,7 @@ use crate::server::http::extract::{Path, Query};
 use crate::server::http::page::Page;
 use crate::server::http::problem::ApiError;
 use crate::server::state::App;
+use foreframe_core::frame::warp::CameraModel;
 use foreframe_core::frame::{Frame, FrameError, codec};
 use foreframe_core::types::{Channel, DatasetName};
 use foreframe_data::dataset::{Dataset, DatasetError};
@@ -72,6 +73,9 @@ struct DatasetDescription {
     scenario: Option<String>,
     /// The seed of the simulation, if it was simulated.
     seed: Option<u64>,
+    /// How the camera projects; absent where that is not known.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    camera: Option<CameraModel>,
     /// Whether it has masks that tell what is seen at each pixel.
     has_masks: bool,
 }
@@ -152,7 +156,7 @@ async fn animation(app: App, Path((name, episode)): Path<(String, usize)>) -> Re
 }
 
 /// The name in the path. Errors: 404 if it is no valid name.
-async fn dataset_name(app: &App, text: &str) -> Result<DatasetName, ApiError> {
+pub(super) async fn dataset_name(app: &App, text: &str) -> Result<DatasetName, ApiError> {
     datasets::named(app.store().objects(), text).await.map_err(absent)
 }
 
@@ -171,6 +175,7 @@ async fn describe(app: &App, name: &DatasetName) -> Result<DatasetDescription, A
         content_hash: info.content_hash,
         scenario: info.scenario,
         seed: info.seed.map(|seed| seed.0),
+        camera: info.camera,
         has_masks: info.has_masks,
     })
 }
@@ -212,7 +217,7 @@ fn contact_sheet(title: &str, frames: Vec<Frame>) -> Result<Vec<u8>, FrameError>
 }
 
 /// The data set is in the path, so that it does not exist is 404, not 422.
-fn absent(error: JobError) -> ApiError {
+pub(super) fn absent(error: JobError) -> ApiError {
     match error {
         JobError::NotFound { .. } => ApiError::NotFound(error.to_string()),
         other => other.into(),

@@ -18,8 +18,8 @@ use crate::server::state::App;
 use foreframe_core::nn::spec::MAX_MODEL_SIDE_PX;
 use foreframe_core::types::{Action, Channel, Seed};
 use foreframe_sim::{
-    Environment, Observation, Scenario, SimError, StepResult, TrialParameters, World, WorldConfig, action_channels,
-    state_channels,
+    Environment, Observation, PlanarPose, Scenario, SimError, StepResult, TrialParameters, World, WorldConfig,
+    action_channels, state_channels,
 };
 
 pub(in crate::server) fn routes() -> OpenApiRouter<App> {
@@ -77,6 +77,8 @@ struct Info {
     time_s: f64,
     /// The next action of the simulator's own driver.
     policy_action: Vec<f32>,
+    /// The true poses of all robots, first that of the robot with the camera.
+    poses: Vec<PlanarPose>,
     /// The random parameters of the episode; only at its start.
     #[serde(skip_serializing_if = "Option::is_none")]
     trial: Option<TrialParameters>,
@@ -251,8 +253,15 @@ fn info(world: Option<&World>, observation: &Observation, trial: Option<TrialPar
     Info {
         time_s: observation.time_s,
         policy_action: world.map_or_else(Vec::new, |world| world.policy_action().into()),
+        poses: world.map_or_else(Vec::new, poses),
         trial,
     }
+}
+
+fn poses(world: &World) -> Vec<PlanarPose> {
+    std::iter::once(world.observer_pose())
+        .chain(world.other_robot_poses())
+        .collect()
 }
 
 fn lock(environment: &SharedEnvironment) -> MutexGuard<'_, Environment> {

@@ -1,7 +1,7 @@
 //! Pages for people and contracts for programs. Nothing is fetched from elsewhere: scripts and styles are part of the program.
 //!
-//! `/` shows a simulated robot to drive, its frames beside the predicted ones, the models, and the running jobs; at `/docs`,
-//! requests can be tried out. The contracts are `OpenAPI` for the requests and `AsyncAPI` for the streams.
+//! `/` is the page with the views Play, Dream, What if, Data and Train; `server/page` holds its modules. At `/docs`, requests
+//! can be tried out. The contracts are `OpenAPI` for the requests and `AsyncAPI` for the streams.
 
 use std::sync::Arc;
 
@@ -16,26 +16,69 @@ use utoipa_swagger_ui::{Config, SwaggerUi};
 
 use crate::server::state::App;
 
-const PAGE: &str = include_str!("../dashboard/index.html");
-const SCRIPT: &str = include_str!("../dashboard/dashboard.js");
-const STYLE: &str = include_str!("../dashboard/dashboard.css");
+const PAGE: &str = include_str!("../page/index.html");
+
+/// A file of the page, by its path.
+macro_rules! page_files {
+    ($($name:literal),* $(,)?) => {
+        [$((concat!("/page/", $name), include_str!(concat!("../page/", $name))),)*]
+    };
+}
+
+const PAGE_FILES: [(&str, &str); 28] = page_files![
+    "address.js",
+    "api.js",
+    "app.js",
+    "base64.js",
+    "data.js",
+    "dream.js",
+    "episode.js",
+    "gif.js",
+    "gray.js",
+    "job.js",
+    "keys.js",
+    "models.js",
+    "picture.js",
+    "play.js",
+    "plot.js",
+    "preact.js",
+    "predict.js",
+    "robot.js",
+    "score.js",
+    "server_lists.js",
+    "snippets.js",
+    "sources.js",
+    "stream.js",
+    "style.css",
+    "train.js",
+    "uplot.css",
+    "uplot.js",
+    "what_if.js",
+];
+
 const STREAMS: &str = include_str!("../../../openapi/asyncapi.yaml");
 
-/// Script, style and pictures come from this server, frames from its answers; nothing from elsewhere.
-const DASHBOARD_POLICY: &str =
-    "default-src 'self'; img-src 'self' data:; script-src 'self'; style-src 'self'; frame-ancestors 'none'";
+/// Scripts and styles come from this server, pictures from its answers; nothing from elsewhere.
+const PAGE_POLICY: &str = "default-src 'self'; img-src 'self' data: blob:; script-src 'self'; style-src 'self'; \
+     object-src 'none'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
 /// Everything comes from this server. The pages write styles into their elements.
 const DOCS_POLICY: &str = "default-src 'self'; img-src 'self' data:; script-src 'self'; \
      style-src 'self' 'unsafe-inline'; object-src 'none'; base-uri 'none'; frame-ancestors 'none'";
 
 pub(in crate::server) fn routes() -> OpenApiRouter<App> {
-    let asset = |media_type, text| get(async move || ([(header::CONTENT_TYPE, media_type)], text));
-    OpenApiRouter::new()
+    let pages = OpenApiRouter::new()
         .routes(routes!(page))
         .routes(routes!(openapi_json))
-        .routes(routes!(asyncapi_yaml))
-        .route("/dashboard.js", asset("text/javascript; charset=utf-8", SCRIPT))
-        .route("/dashboard.css", asset("text/css; charset=utf-8", STYLE))
+        .routes(routes!(asyncapi_yaml));
+    PAGE_FILES.into_iter().fold(pages, |pages, (path, text)| {
+        let media_type = if path.ends_with(".css") {
+            "text/css"
+        } else {
+            "text/javascript"
+        };
+        let headers = [(header::CONTENT_TYPE, format!("{media_type}; charset=utf-8"))];
+        pages.route(path, get(async move || (headers, text)))
+    })
 }
 
 /// `/docs`.
@@ -56,7 +99,7 @@ pub(in crate::server) fn docs() -> Router<App> {
     responses((status = 200, description = "A page", content_type = "text/html"))
 )]
 async fn page() -> impl IntoResponse {
-    ([(header::CONTENT_SECURITY_POLICY, DASHBOARD_POLICY)], Html(PAGE))
+    ([(header::CONTENT_SECURITY_POLICY, PAGE_POLICY)], Html(PAGE))
 }
 
 /// The OpenAPI document as text; clones share it.

@@ -6,7 +6,7 @@ use super::files::verify;
 use super::layout::{DatasetMetadata, EPISODES};
 use super::shard_reader::{ImageTarget, Shard};
 use super::tables::read_episodes;
-use crate::dataset::{Dataset, DatasetError, DatasetInfo};
+use crate::dataset::{Dataset, DatasetError, DatasetInfo, EpisodeData};
 use foreframe_core::frame::Frame;
 
 /// The description of the finished data set in a directory, without reading its frames.
@@ -22,8 +22,16 @@ pub fn describe_metadata(path: &Path, text: &[u8]) -> Result<DatasetInfo, Datase
 }
 
 impl Dataset {
-    /// The frames of one episode. Errors: `NoEpisode`, and those of [`Dataset::open`].
+    /// The frames of one episode. Errors: as [`Dataset::read_episode`].
     pub fn episode_frames(directory: &Path, episode: usize) -> Result<Vec<Frame>, DatasetError> {
+        let (info, data) = Self::read_episode(directory, episode)?;
+        let frames = data.pixels.chunks_exact(info.frame_pixels());
+        let frame = |pixels: &[u8]| Frame::new(info.frame_width_px, info.frame_height_px, pixels.to_vec());
+        frames.map(|pixels| Ok(frame(pixels)?)).collect()
+    }
+
+    /// One episode without masks, and the data set's description. Errors: `NoEpisode`, and those of [`Dataset::open`].
+    pub fn read_episode(directory: &Path, episode: usize) -> Result<(DatasetInfo, EpisodeData), DatasetError> {
         let metadata = DatasetMetadata::read(directory)?;
         let info = DatasetInfo {
             // They are not read.
@@ -44,16 +52,32 @@ impl Dataset {
         let episodes = read_episodes(&table, &info)?;
         let wanted = episodes.get(episode).ok_or_else(missing)?;
         let content = shard.read(&info, ImageTarget::Memory)?;
-        let start = wanted.first_frame.saturating_sub(shard.frames.start);
-        let frames = content.pixels.into_iter().skip(start).take(wanted.frame_count);
-        frames
-            .map(|pixels| {
-                Ok(Frame::new(
-                    info.frame_width_px,
-                    info.frame_height_px,
-                    pixels.into_vec(),
-                )?)
-            })
-            .collect()
+        let frames = FrameRange {
+            start: wanted.first_frame.saturating_sub(shard.frames.start),
+            count: wanted.frame_count,
+        };
+        let data = EpisodeData {
+            timestamps_s: frames.of(content.timestamps_s, 1),
+            pixels: frames.of(content.pixels, 1).concat(),
+            masks: None,
+            actions: frames.of(content.actions, info.action_channels.len()),
+            states: frames.of(content.states, info.state_channels.len()),
+            trial: wanted.trial.clone(),
+        };
+        Ok((info, data))
+    }
+}
+
+/// Frames of a shard.
+struct FrameRange {
+    start: usize,
+    count: usize,
+}
+
+impl FrameRange {
+    /// The values of these frames, of `each` values a frame.
+    fn of<T>(&self, values: Vec<T>, each: usize) -> Vec<T> {
+        let values = values.into_iter().skip(self.start * each);
+        values.take(self.count * each).collect()
     }
 }

@@ -1,0 +1,103 @@
+// Data: the data sets as cards, and one of them with its episodes and its inspection.
+
+import { html, useState } from "./preact.js";
+import { link, note } from "./address.js";
+import { call } from "./api.js";
+import { Episode, Moving } from "./episode.js";
+import { Embedded, Progress, Steer, titleOf, useJob } from "./job.js";
+import { Copy, curl, requests } from "./snippets.js";
+
+export function Data({ lists, parameters }) {
+  if (!lists.may_use_jobs) return html`<div class="empty"><h1>This key may not see the data sets</h1><p>It is a key for predictions. Data sets need a key with the scope <code>jobs</code>.</p></div>`;
+  if (!lists.datasets) return html`<p class="quiet wait">Loading…</p>`;
+  const dataset = lists.datasets.find(({ name }) => name === parameters.set);
+  return dataset ? html`<${DataSet} dataset=${dataset} models=${lists.models ?? []} parameters=${parameters} />`
+    : html`<${Overview} datasets=${lists.datasets} missing=${parameters.set} />`;
+}
+
+function Overview({ datasets, missing }) {
+  return html`<section>
+    <h1>Data sets</h1>
+    ${missing && html`<p class="wrong">There is no data set “${missing}”.</p>`}
+    ${!datasets.length && html`<div class="empty"><h2>None yet</h2><p>Collect one from the simulator, or import a recording. It appears here when the job is done.</p></div>`}
+    <div class="cards">${datasets.map(dataset => html`<a class="card" key=${dataset.name} href=${link("data", { set: dataset.name })}>
+      <${Moving} dataset=${dataset} /><h2>${dataset.name}</h2><${Facts} dataset=${dataset} /></a>`)}</div>
+    <${NewData} />
+    <footer><${Copy} curl=${() => curl("GET", "/v1/datasets")} python=${() => requests("GET", "/v1/datasets")} /></footer>
+  </section>`;
+}
+
+const channels = list => list.map(({ name }) => name).join(", ") || "none";
+function Facts({ dataset }) {
+  const length_s = dataset.frames * dataset.frame_period_s;
+  const facts = [["episodes", dataset.episodes], ["frames", dataset.frames.toLocaleString("en")], ["length", length_s < 120 ? `${length_s.toFixed(0)} s` : `${(length_s / 60).toFixed(0)} min`],
+    ["size", `${dataset.frame_width_px}×${dataset.frame_height_px} px`], ["actions", channels(dataset.actions)], ["source", dataset.scenario ? `simulator, ${dataset.scenario}` : "recorded"]];
+  return html`<dl class="facts">${facts.map(([name, value]) => html`<dt>${name}</dt><dd>${value}</dd>`)}</dl>`;
+}
+
+function DataSet({ dataset, models, parameters }) {
+  const number = Math.max(0, Math.min(dataset.episodes - 1, +(parameters.episode ?? 0) || 0));
+  const [shows, setShows] = useState(false);
+  const move = to => note({ episode: to, frame: 0 });
+  return html`<section>
+    <p><a href="#data">‹ all data sets</a></p>
+    <h1>${dataset.name}</h1>
+    <div class="choice"><label>Episode <input type="number" min="0" max=${dataset.episodes - 1} value=${number} onChange=${event => move(event.target.value)} /></label>
+      <span class="of">of ${dataset.episodes}</span><button class="small" disabled=${number === 0} onClick=${() => move(number - 1)}>previous</button>
+      <button class="small" disabled=${number >= dataset.episodes - 1} onClick=${() => move(number + 1)}>next</button></div>
+    <${Episode} key=${`${dataset.name} ${number}`} dataset=${dataset} number=${number} models=${models} parameters=${parameters} />
+    <details onToggle=${event => setShows(event.target.open)}><summary>Inspection: what to look at before training</summary>
+      ${shows && html`<${Embedded} path=${`/v1/datasets/${dataset.name}/inspection`} label="inspection" />`}</details>
+  </section>`;
+}
+
+const SCENARIOS = ["moving-observer", "static-observer", "crowded"];
+
+function NewData() {
+  const [job_id, setJob] = useState(null);
+  const [wrong, setWrong] = useState("");
+  const submit = spec => call("POST", "/v1/jobs", spec).then(job => { setJob(job.id); setWrong(""); }, error => setWrong(error.message));
+  return html`<h2>New data set</h2>
+    <div class="forms"><${Collect} submit=${submit} /><${Import} submit=${submit} /></div>
+    <p class="wrong" role="alert">${wrong}</p>
+    ${job_id && html`<${Follow} id=${job_id} />`}`;
+}
+
+function Follow({ id }) {
+  const { job } = useJob(id);
+  if (!job) return html`<p class="quiet">${id} is queued…</p>`;
+  return html`<div class="card"><h3>${titleOf(job.spec)}</h3><${Progress} job=${job} /><div class="actions"><${Steer} job=${job} />
+    ${job.state === "succeeded" && html`<a href=${link("data", { set: job.spec.name })}>open it</a>`}</div></div>`;
+}
+
+// The fields of a form that are not empty.
+const filled = form => Object.fromEntries([...new FormData(form)].filter(([, value]) => value !== ""));
+const handler = make => event => {
+  event.preventDefault();
+  make(filled(event.target));
+};
+
+function Collect({ submit }) {
+  const onSubmit = handler(({ name, scenario, trials, seed }) => submit({ kind: "collect", name, scenario, trials: +trials, seed: +seed }));
+  return html`<form class="card" onSubmit=${onSubmit}><h3>Collect from the simulator</h3><div class="form">
+    <label>Name <input name="name" required pattern="[a-z0-9][a-z0-9\\-]*" placeholder="first" /></label>
+    <label>Scenario <select name="scenario">${SCENARIOS.map(one => html`<option value=${one}>${one}</option>`)}</select></label>
+    <label>Trials <input name="trials" type="number" min="1" max="1000000" value="50" /></label>
+    <label>Seed <input name="seed" type="number" min="0" value="1" /></label>
+    </div><div class="actions"><button class="main">Collect</button></div></form>`;
+}
+
+function Import({ submit }) {
+  const list = words => words?.split(/[\s,]+/).filter(Boolean);
+  const onSubmit = handler(({ name, source, size, rate, action, state }) => submit({
+    kind: "import", name, source, size, ...(rate && { rate: +rate }), ...(action && { action: list(action) }), ...(state && { state: list(state) }),
+  }));
+  return html`<form class="card" onSubmit=${onSubmit}><h3>Import a recording</h3><div class="form">
+    <label>Name <input name="name" required pattern="[a-z0-9][a-z0-9\\-]*" placeholder="mycar" /></label>
+    <label>Path in the import folder <input name="source" required placeholder="drive-1" /></label>
+    <label>Size <input name="size" value="64x64" pattern="[0-9]{1,4}x[0-9]{1,4}" /></label>
+    <label>Frames per second <input name="rate" type="number" step="any" min="0.01" placeholder="as recorded" /></label>
+    <label>Actions <input name="action" placeholder="found by name" /></label>
+    <label>States <input name="state" placeholder="found by name" /></label>
+    </div><div class="actions"><button class="main">Import</button></div></form>`;
+}

@@ -1,0 +1,160 @@
+// A background job: its progress by server-sent events, its log, its losses and its report.
+
+import { html, useEffect, useRef, useState } from "./preact.js";
+import { blob, call, get, listen, text } from "./api.js";
+
+const FINAL = ["succeeded", "failed", "cancelled"];
+export const isFinal = job => FINAL.includes(job.state);
+export const titleOf = ({ kind, name, model, dataset }) => `${kind} ${name ?? model}${dataset ? ` on ${dataset}` : ""}`;
+
+// Lines of a log that are kept.
+const MOST_LINES = 500;
+// Losses are read again after an event, but not more often than this.
+const LOSSES_EVERY_MS = 1000;
+
+// The job as it is now, its log and its losses.
+export function useJob(id) {
+  const [known, setKnown] = useState({ job: null, lines: [], losses: [] });
+  useEffect(() => {
+    setKnown({ job: null, lines: [], losses: [] });
+    if (!id) return undefined;
+    let read_ms = -Infinity;
+    const readLosses = async () => {
+      read_ms = performance.now();
+      const { points } = await get(`/v1/jobs/${id}/metrics`).catch(() => ({ points: [] }));
+      setKnown(now => ({ ...now, losses: points }));
+    };
+    return listen(`/v1/jobs/${id}/events`, (name, data) => {
+      if (name === "log") setKnown(now => ({ ...now, lines: [...now.lines, data].slice(-MOST_LINES) }));
+      if (name !== "job") return false;
+      setKnown(now => ({ ...now, job: data }));
+      const is_over = isFinal(data);
+      if (data.spec.kind === "train" && (is_over || performance.now() - read_ms > LOSSES_EVERY_MS)) readLosses();
+      return is_over;
+    });
+  }, [id]);
+  return known;
+}
+
+export const duration = seconds => (seconds < 90 ? `${Math.ceil(seconds)} s` : seconds < 5400 ? `${Math.round(seconds / 60)} min` : `${(seconds / 3600).toFixed(1)} h`);
+
+export function Progress({ job }) {
+  const { done, total, remaining_s, message } = job.progress;
+  const is_running = job.state === "running";
+  const words = [total ? `${done} of ${total}` : "", is_running ? message : job.state, is_running && remaining_s != null ? `${duration(remaining_s)} left` : "",
+    job.losses.train == null ? "" : `loss ${job.losses.train.toPrecision(3)}`].filter(Boolean);
+  // Without a value, the bar says that the total is unknown.
+  const value = total ? { max: total, value: done } : is_running ? {} : { max: 1, value: 0 };
+  return html`<div><progress aria-label=${`progress of ${titleOf(job.spec)}`} ...${value} />
+    <p class="quiet">${words.join(", ")}${job.cancelling && is_running ? "; stopping" : ""}</p>${job.error && html`<p class="wrong">${job.error}</p>`}</div>`;
+}
+
+// Cancel or resume, whichever fits.
+export function Steer({ job }) {
+  const [wrong, setWrong] = useState("");
+  const ask = what => () => call("POST", `/v1/jobs/${job.id}/${what}`).then(() => setWrong(""), error => setWrong(error.message));
+  return html`${!isFinal(job) && !job.cancelling && html`<button class="small" onClick=${ask("cancel")}>Cancel</button>`}
+    ${["failed", "cancelled"].includes(job.state) && html`<button class="small" onClick=${ask("resume")}>Resume</button>`}
+    ${wrong && html`<span class="wrong">${wrong}</span>`}`;
+}
+
+// The newest line is in sight.
+export function Log({ lines }) {
+  const place = useRef();
+  useEffect(() => { place.current.scrollTop = place.current.scrollHeight; }, [lines.length]);
+  return html`<pre class="log" ref=${place} tabindex="0" aria-label="log">${lines.map(({ line }) => `${line}\n`)}${lines.length ? "" : "no lines yet"}</pre>`;
+}
+
+// A picture of the server, with the key.
+export function ServerPicture({ path, alt, className = "" }) {
+  const [url, setUrl] = useState(null);
+  useEffect(() => {
+    let made = null, is_gone = false;
+    blob(path).then(picture => { if (!is_gone) setUrl(made = URL.createObjectURL(picture)); }, () => {});
+    return () => {
+      is_gone = true;
+      if (made) URL.revokeObjectURL(made);
+    };
+  }, [path]);
+  return url ? html`<img src=${url} alt=${alt} class=${className} />` : html`<span class="quiet">${alt}…</span>`;
+}
+
+// An HTML page of the server inside this one: its styles apply only to it, and its scripts do not run.
+export function Embedded({ path, label }) {
+  const place = useRef();
+  const [state, setState] = useState("drawing…");
+  useEffect(() => {
+    let is_gone = false;
+    setState("drawing…");
+    patiently(path).then(page => {
+      if (is_gone) return;
+      // Style elements in the text would break this page's security policy.
+      const styles = [...page.matchAll(/<style>(.*?)<\/style>/gs)].map(([, rules]) => sheet(rules));
+      const parsed = new DOMParser().parseFromString(page.replaceAll(/<style>.*?<\/style>/gs, ""), "text/html");
+      const root = place.current.shadowRoot ?? place.current.attachShadow({ mode: "open" });
+      root.adoptedStyleSheets = styles;
+      const body = Object.assign(document.createElement("div"), { className: "body" });
+      body.append(...parsed.body.childNodes);
+      root.replaceChildren(body);
+      setState("");
+    }, error => setState(error.message));
+    return () => { is_gone = true; };
+  }, [path]);
+  return html`<div>${state && html`<p class="quiet">${state}</p>`}<div ref=${place} role="region" aria-label=${label} /></div>`;
+}
+
+const TRIES = 10;
+
+// The server draws on after the request's deadline, and keeps the page: the next request gets it.
+async function patiently(path) {
+  for (let tries = 1; ; tries++) {
+    try {
+      return await text(path);
+    } catch (error) {
+      if (error.status !== 408 || tries === TRIES) throw error;
+    }
+  }
+}
+
+function sheet(rules) {
+  const made = new CSSStyleSheet();
+  made.replaceSync(`${rules.replaceAll(":root", ":host").replaceAll(/(^|[\s,}])body(?=[\s,{])/g, "$1.body")} .body { max-width: none; margin: 0; padding: 0; }`);
+  return made;
+}
+
+// The report of an evaluation.
+export function Report({ job }) {
+  const files = job.result?.files ?? [];
+  const path = file => `/v1/jobs/${job.id}/files/${file}`;
+  if (files.includes("report.html")) return html`<${Embedded} path=${path("report.html")} label="report" />`;
+  return files.includes("report.md") ? html`<${Markdown} path=${path("report.md")} picture=${path} />` : null;
+}
+
+// What a report in Markdown uses: headings, paragraphs, lists, tables and pictures.
+function Markdown({ path, picture }) {
+  const [blocks, setBlocks] = useState([]);
+  useEffect(() => {
+    text(path).then(words => setBlocks(words.split(/\n{2,}/)), error => setBlocks([error.message]));
+  }, [path]);
+  return html`<div class="report">${blocks.map(block => html`<${Block} text=${block.trim()} picture=${picture} />`)}</div>`;
+}
+
+function Block({ text: words, picture }) {
+  const heading = words.match(/^(#+) (.*)/);
+  if (heading) return heading[1].length === 1 ? html`<h2>${heading[2]}</h2>` : html`<h3>${heading[2]}</h3>`;
+  const figure = words.match(/^!\[(.*?)\]\((.*?)\)$/);
+  if (figure) return html`<p><${ServerPicture} path=${picture(figure[2])} alt=${figure[1] || figure[2]} /></p>`;
+  if (words.startsWith("|")) return html`<${Table} rows=${words.split("\n")} />`;
+  if (/^[-*] /.test(words)) return html`<ul>${words.split(/\n[-*] /).map(line => html`<li>${inline(line.replace(/^[-*] /, ""))}</li>`)}</ul>`;
+  return html`<p>${inline(words)}</p>`;
+}
+
+function Table({ rows }) {
+  const cells = row => row.replaceAll(/^\||\|$/g, "").split("|").map(cell => inline(cell.trim()));
+  const [head, , ...body] = rows;
+  return html`<div class="table" tabindex="0"><table><thead><tr>${cells(head).map(cell => html`<th scope="col">${cell}</th>`)}</tr></thead>
+    <tbody>${body.map(row => html`<tr>${cells(row).map(cell => html`<td>${cell}</td>`)}</tr>`)}</tbody></table></div>`;
+}
+
+const inline = words => words.split(/(`[^`]*`|\*\*[^*]*\*\*)/).map(part => (part.startsWith("`") ? html`<code>${part.slice(1, -1)}</code>`
+  : part.startsWith("**") ? html`<b>${part.slice(2, -2)}</b>` : part));

@@ -1,0 +1,155 @@
+// A robot and a model that predicts its frames: the loop that Play, Dream and What if share.
+
+import { useEffect, useState } from "./preact.js";
+import { isLocked } from "./server_lists.js";
+import { pause } from "./api.js";
+import { heldAction, isManual } from "./keys.js";
+import { predictLast } from "./predict.js";
+import { compare, lookBack } from "./score.js";
+import { openSource } from "./sources.js";
+import { sendAll, Stream } from "./stream.js";
+
+const HISTORY_S = 30;
+const FIRST_WAIT_MS = 200;
+const LONGEST_WAIT_MS = 3000;
+
+export class Robot {
+  constructor(model, source_id, episode) {
+    Object.assign(this, { model, source_id, episode, spec: model.spec });
+    // Moments, the latest last: see sources.js; with action and prediction, and how it compares with what was predicted for it.
+    this.history = [];
+    // starting, collecting, running or reconnecting.
+    this.status = "starting";
+    this.have = 0;
+    this.error = "";
+    this.speed = 1;
+    // While true, the robot stands; What if shows what it could do.
+    this.is_held = false;
+    // Actions that it has to carry out first.
+    this.plan = [];
+    // Called with each moment and its action before the next one: Dream's step.
+    this.beside = async () => {};
+    this.listeners = new Set();
+    this.wake = () => {};
+    this.visible = () => this.wake();
+    document.addEventListener("visibilitychange", this.visible);
+    this.run();
+  }
+
+  tell() {
+    for (const listener of this.listeners) listener();
+  }
+
+  get is_drivable() {
+    return this.source?.is_drivable ?? false;
+  }
+
+  // The moments that the model's context holds, of one episode.
+  get context() {
+    const begin = this.history.findLastIndex(({ begins }) => begins);
+    return this.history.slice(Math.max(begin, this.history.length - this.spec.context));
+  }
+
+  hold(is_held) {
+    this.is_held = is_held;
+    this.wake();
+  }
+
+  carryOut(plan) {
+    this.plan = [...plan];
+    this.wake();
+  }
+
+  nextAction(moment) {
+    if (this.plan.length) return this.plan.shift();
+    return this.is_drivable && isManual() ? heldAction(this.spec.actions) : moment.driver;
+  }
+
+  async run() {
+    for (let wait_ms = FIRST_WAIT_MS; !this.is_closed; wait_ms = Math.min(1.5 * wait_ms, LONGEST_WAIT_MS)) {
+      try {
+        await this.connect();
+        wait_ms = FIRST_WAIT_MS;
+        while (!this.is_closed) await this.tick();
+        this.disconnect();
+      } catch (error) {
+        this.disconnect();
+        if (this.is_closed || isLocked(error)) return;
+        this.status = "reconnecting";
+        this.error = error.message;
+        this.tell();
+        await pause(wait_ms);
+      }
+    }
+  }
+
+  async connect() {
+    this.source = await openSource(this.model, this.source_id, this.episode);
+    this.now = this.source.first;
+  }
+
+  disconnect() {
+    this.stream?.close();
+    this.source?.close();
+    this.stream = this.source = null;
+  }
+
+  async tick() {
+    while ((document.hidden || (this.is_held && !this.plan.length && this.status === "running")) && !this.is_closed) {
+      await new Promise(wake => { this.wake = wake; });
+    }
+    if (this.is_closed) return;
+    const started_ms = performance.now();
+    const moment = this.now;
+    // A stream has the context of one episode.
+    if (moment.begins || !this.stream || this.stream.socket.readyState !== WebSocket.OPEN) await this.openStream();
+    moment.action = this.nextAction(moment);
+    const [answer, next, comparison] = await Promise.all([this.stream.send(moment), this.source.step(moment.action), this.compare(moment), this.beside(moment)]);
+    this.receive(Object.assign(moment, comparison), answer);
+    this.now = next;
+    this.tell();
+    const period_ms = (1000 * this.spec.frame_period_s) / this.speed;
+    await pause(Math.max(0, period_ms - (performance.now() - started_ms)));
+  }
+
+  // A new stream, with the context so far.
+  async openStream() {
+    this.stream?.close();
+    this.stream = await Stream.open(this.model.name);
+    if (!this.now.begins) await sendAll(this.stream, this.context.slice(1 - this.spec.context));
+  }
+
+  // How the moment compares with what the model predicts for it from the frames up to `horizon` ago and the actions since.
+  async compare(moment) {
+    const past = lookBack([...this.history, moment], this.spec);
+    return past && compare(moment.frame, past.context, await predictLast(this.model, past.context, past.plan));
+  }
+
+  receive(moment, answer) {
+    moment.at_s = performance.now() / 1000;
+    if (answer.type === "prediction") moment.prediction = answer;
+    this.history.push(moment);
+    this.status = answer.type === "prediction" ? "running" : "collecting";
+    this.have = answer.have ?? this.spec.context;
+    this.error = "";
+    const kept = Math.ceil(HISTORY_S / this.spec.frame_period_s) + this.spec.horizon + this.spec.context;
+    if (this.history.length > kept) this.history.shift();
+  }
+
+  close() {
+    this.is_closed = true;
+    document.removeEventListener("visibilitychange", this.visible);
+    this.disconnect();
+    this.wake();
+  }
+}
+
+// Draws the component again after every moment of the robot.
+export function useMoments(robot) {
+  const [, setTurn] = useState(0);
+  useEffect(() => {
+    const listener = () => setTurn(turn => turn + 1);
+    robot?.listeners.add(listener);
+    return () => robot?.listeners.delete(listener);
+  }, [robot]);
+}

@@ -1,0 +1,68 @@
+// What the server has: models, data sets and jobs. Its events say when to read a list again.
+
+import { useEffect, useState } from "./preact.js";
+import { ApiError, all, get, listen, Locked, onLocked } from "./api.js";
+
+// connection: connecting, connected, reconnecting, stopping or locked. A list is null until it is known.
+export let lists = { connection: "connecting", locked: null, models: null, notice: null, datasets: null, jobs: null, may_use_jobs: true };
+const listeners = new Set();
+
+function change(changes) {
+  lists = { ...lists, ...changes };
+  for (const listener of listeners) listener(lists);
+}
+
+export function useLists() {
+  const [known, setKnown] = useState(lists);
+  useEffect(() => {
+    listeners.add(setKnown);
+    setKnown(lists);
+    return () => listeners.delete(setKnown);
+  }, []);
+  return known;
+}
+
+// The best first: by the skill on test data; models without a score last.
+const bySkill = (one, other) => (skillOf(other) ?? -9) - (skillOf(one) ?? -9) || one.name.localeCompare(other.name);
+export const skillOf = model => model.metrics.test?.skill;
+export const takesActions = model => model.spec.conditioning.endsWith("action");
+export const takesState = model => model.spec.conditioning.startsWith("state");
+
+export async function readModels() {
+  const { models, notice } = await all("/v1/models", "models");
+  change({ models: models.sort(bySkill), notice: notice ?? null });
+}
+
+export async function readJobs() {
+  try {
+    const [{ jobs }, { datasets }] = await Promise.all([get("/v1/jobs?limit=100"), all("/v1/datasets", "datasets")]);
+    change({ jobs, datasets, may_use_jobs: true });
+  } catch (error) {
+    // A key for predictions only.
+    if (!(error instanceof ApiError && error.status === 403)) throw error;
+    change({ jobs: [], datasets: [], may_use_jobs: false });
+  }
+}
+
+// A list that could not be read is read again after the next event; "lost" follows.
+const quietly = work => work().catch(() => {});
+
+let stop = () => {};
+export function follow() {
+  stop();
+  // The first list need not wait for the events.
+  quietly(readModels);
+  stop = listen("/v1/events", name => {
+    if (name === "open") change({ connection: "connected", locked: null });
+    else if (name === "lost") change({ connection: "reconnecting" });
+    else if (name === "stopping") change({ connection: "stopping" });
+    else if (name === "models") quietly(readModels);
+    else if (name === "jobs") quietly(readJobs);
+  });
+}
+
+onLocked(why => {
+  stop();
+  change({ connection: "locked", locked: why });
+});
+export const isLocked = error => error instanceof Locked;

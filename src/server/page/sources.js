@@ -1,0 +1,126 @@
+// Where frames come from: the simulator, or a recorded episode. And which sources fit a model.
+
+import { call, deleteAtEnd, get } from "./api.js";
+import { fromPng } from "./gray.js";
+import { takesActions, takesState } from "./server_lists.js";
+
+const SIMULATOR_ACTIONS = ["linear", "angular"];
+export const SIMULATOR_STATES = ["x", "y", "heading_cos", "heading_sin", "linear", "angular"];
+// The camera of the simulated robot, unless the model names another one.
+const DEFAULT_CAMERA = { height_m: 0.6, horizontal_fov_rad: Math.PI / 3, tilt_down_rad: 0.2, noise_std: 1 / 255 };
+
+const names = channels => channels.map(({ name }) => name);
+const areEqual = (one, other) => one.length === other.length && one.every((name, index) => name === other[index]);
+const isNear = (one, other) => Math.abs(one - other) <= 0.01 * Math.abs(other);
+
+// Why the simulator does not fit a model; an empty text if it does.
+export function whyNotSimulator({ spec, lineage }) {
+  if (!lineage.scenario) return "it was trained on recordings, not on the simulator";
+  if (takesActions({ spec }) && !areEqual(names(spec.actions), SIMULATOR_ACTIONS)) return "it takes other actions";
+  if (takesState({ spec }) && !areEqual(names(spec.states), SIMULATOR_STATES)) return "it takes another state";
+  return "";
+}
+
+// Why a data set does not fit a model; an empty text if it does.
+export function whyNotDataset(model, dataset) {
+  const { spec, lineage } = model;
+  const size = of => `${of.frame_width_px}×${of.frame_height_px} px`;
+  if (size(spec) !== size(dataset)) return `its frames are ${size(dataset)}; the model takes ${size(spec)}`;
+  if (!isNear(dataset.frame_period_s, spec.frame_period_s)) {
+    return `its frames are ${dataset.frame_period_s} s apart; the model takes ${spec.frame_period_s} s`;
+  }
+  if (takesActions(model) && !areEqual(names(spec.actions), names(dataset.actions))) return "it has other actions";
+  if (takesState(model) && !areEqual(names(spec.states), names(dataset.states))) return "it has another state";
+  if (Boolean(lineage.scenario) !== Boolean(dataset.scenario)) {
+    return dataset.scenario ? "it is simulated; the model was trained on recordings" : "it is recorded; the model was trained in the simulator";
+  }
+  if (spec.camera && dataset.camera && !isNear(dataset.camera.horizontal_fov_rad, spec.camera.horizontal_fov_rad)) return "it has another camera";
+  return "";
+}
+
+// The sources that a model can be offered: { id, label }.
+export function sourcesOf(model, datasets) {
+  const simulator = whyNotSimulator(model) ? [] : [{ id: "simulator", label: "simulator" }];
+  const fitting = (datasets ?? []).filter(dataset => !whyNotDataset(model, dataset));
+  return [...simulator, ...fitting.map(({ name }) => ({ id: `set:${name}`, label: `recorded: ${name}` }))];
+}
+
+export function openSource(model, id, episode) {
+  return id.startsWith("set:") ? Recording.open(id.slice(4), episode) : Simulator.open(model);
+}
+
+// A simulated robot on the server. A moment is what is known at a frame: the frame, the state, the driver's next action, the true
+// poses, and whether an episode begins.
+export class Simulator {
+  static async open(model) {
+    const { frame_period_s, frame_width_px, frame_height_px, camera } = model.spec;
+    const scenario = model.lineage.scenario;
+    const stands = scenario === "static-observer";
+    const world = { frame_period_s, frame_width_px, frame_height_px, max_duration_s: stands ? 30 : 3600 };
+    if (camera) world.camera = { ...DEFAULT_CAMERA, horizontal_fov_rad: camera.horizontal_fov_rad, tilt_down_rad: camera.tilt_down_rad };
+    const seed = Math.floor(Math.random() * 2 ** 32);
+    const made = await call("POST", "/v1/environments", { scenario, seed, world });
+    return new Simulator(made, !stands, await moment(made, true));
+  }
+
+  constructor({ id }, is_drivable, first) {
+    this.path = `/v1/environments/${id}`;
+    this.is_drivable = is_drivable;
+    this.first = first;
+    this.leave = () => deleteAtEnd(this.path);
+    addEventListener("pagehide", this.leave);
+  }
+
+  async step(action) {
+    const step = await call("POST", `${this.path}/step`, { action });
+    if (!step.terminated && !step.truncated) return moment(step, false);
+    return moment(await call("POST", `${this.path}/reset`, {}), true);
+  }
+
+  close() {
+    removeEventListener("pagehide", this.leave);
+    this.leave();
+  }
+}
+
+async function moment({ observation, info }, begins) {
+  const frame = await fromPng(observation.frame);
+  return { frame, state: observation.state, driver: info.policy_action, poses: info.poses, begins };
+}
+
+const EPISODE_FRAMES = 300;
+
+// The frames of a recorded episode with what belongs to them, decoded.
+export async function readEpisode(dataset, episode, from = 0, limit = EPISODE_FRAMES) {
+  const read = await get(`/v1/datasets/${dataset}/episodes/${episode}?from=${from}&limit=${limit}`);
+  const frames = [];
+  // One after another: they are decoded on one canvas.
+  for (const frame of read.frames) frames.push(await fromPng(frame));
+  return { ...read, frames };
+}
+
+// A recorded episode, over and over. It cannot be driven: its actions are recorded too.
+export class Recording {
+  static async open(dataset, episode = 0) {
+    return new Recording(await readEpisode(dataset, episode));
+  }
+
+  constructor(episode) {
+    this.is_drivable = false;
+    this.episode = episode;
+    this.at = 0;
+    this.first = this.moment();
+  }
+
+  moment() {
+    const { frames, states, actions } = this.episode;
+    return { frame: frames[this.at], state: states[this.at], driver: actions[this.at] ?? [], begins: this.at === 0 };
+  }
+
+  async step() {
+    this.at = (this.at + 1) % this.episode.frames.length;
+    return this.moment();
+  }
+
+  close() {}
+}

@@ -1,0 +1,160 @@
+// Train: trainings and evaluations, their curves and reports, and the models that come of them.
+
+import { html, useEffect, useMemo, useState } from "./preact.js";
+import { link, note } from "./address.js";
+import { call, get } from "./api.js";
+import { duration, Log, Progress, Report, Steer, titleOf, useJob } from "./job.js";
+import { Models } from "./models.js";
+import { COLORS, Plot } from "./plot.js";
+import { Copy, curl, requests } from "./snippets.js";
+
+export function Train({ lists, parameters }) {
+  const { models, datasets, jobs, may_use_jobs } = lists;
+  return html`<section>
+    <h1>Train</h1>
+    ${may_use_jobs ? html`<${Trainings} models=${models ?? []} datasets=${datasets} jobs=${jobs} parameters=${parameters} />`
+      : html`<p class="quiet">This key may not use jobs; they need the scope <code>jobs</code>.</p>`}
+    <h2>Models</h2>
+    ${models ? html`<${Models} models=${models} datasets=${datasets} />` : html`<p class="quiet">Loading…</p>`}
+  </section>`;
+}
+
+function Trainings({ models, datasets, jobs, parameters }) {
+  const [wrong, setWrong] = useState("");
+  const submit = spec => call("POST", "/v1/jobs", spec).then(job => { note({ job: job.id }); setWrong(""); }, error => setWrong(error.message));
+  if (!datasets) return html`<p class="quiet wait">Loading…</p>`;
+  const chosen = parameters.job ?? jobs.find(({ spec }) => spec.kind === "train")?.id;
+  return html`
+    ${datasets.length ? html`<div class="forms"><${NewTraining} datasets=${datasets} jobs=${jobs} submit=${submit} /><${NewEvaluation} models=${models} datasets=${datasets} submit=${submit} /></div>`
+      : html`<div class="empty"><h2>First a data set</h2><p><a href="#data">Collect or import one</a>; then train on it here.</p></div>`}
+    <p class="wrong" role="alert">${wrong}</p>
+    ${jobs.length > 0 && html`<h2>Jobs</h2><${Jobs} jobs=${jobs} chosen=${chosen} />`}
+    ${chosen && html`<${Watched} id=${chosen} jobs=${jobs} />`}`;
+}
+
+// The presets, from the contract.
+function usePresets() {
+  const [presets, setPresets] = useState([]);
+  useEffect(() => {
+    get("/openapi.json").then(contract => setPresets(contract.components.schemas.TrainSpec.properties.preset.enum), () => {});
+  }, []);
+  return presets;
+}
+
+// The preset that was made for such data.
+const proposedPreset = ({ scenario }) => (!scenario ? "recording" : scenario === "static-observer" ? "static-flow" : "moving-flow");
+
+// Lines KEY=VALUE as nested settings: sequence.batch_size=16 is { sequence: { batch_size: 16 } }.
+function settingsOf(lines, steps) {
+  const settings = {};
+  for (const line of [...lines.split("\n"), steps && `sequence.steps=${steps}`]) {
+    const [key, value] = (line || "").split(/=(.*)/s).map(part => part.trim());
+    if (!key || value === undefined) continue;
+    const parts = key.split("."), last = parts.pop();
+    const place = parts.reduce((within, part) => (within[part] ??= {}), settings);
+    try {
+      place[last] = JSON.parse(value);
+    } catch {
+      place[last] = value;
+    }
+  }
+  return settings;
+}
+
+// Seconds for each step of finished trainings of a preset here; null if there was none.
+function secondsPerStep(jobs, preset) {
+  const done = jobs.find(({ spec, state }) => spec.kind === "train" && spec.preset === preset && state === "succeeded");
+  return done && done.progress.total ? (done.ended_unix_s - done.started_unix_s) / done.progress.total : null;
+}
+
+function NewTraining({ datasets, jobs, submit }) {
+  const presets = usePresets();
+  const [form, setForm] = useState({ dataset: datasets[0].name, preset: "", name: "", steps: "", settings: "" });
+  const dataset = datasets.find(({ name }) => name === form.dataset) ?? datasets[0];
+  const preset = form.preset || proposedPreset(dataset);
+  const set = name => event => setForm({ ...form, [name]: event.target.value });
+  const settings = settingsOf(form.settings, form.steps);
+  const spec = { kind: "train", name: form.name || dataset.name, preset, dataset: dataset.name, ...(Object.keys(settings).length && { settings }) };
+  const pace_s = secondsPerStep(jobs, preset);
+  const estimate = !pace_s ? "No training of this preset has finished here yet, so its time is not known; the job tells it after its first steps."
+    : form.steps ? `About ${duration(pace_s * form.steps)}, from the last training of this preset here.`
+    : `The last training of this preset here took ${(1000 * pace_s).toFixed(0)} ms a step.`;
+  return html`<form class="card" onSubmit=${event => { event.preventDefault(); submit(spec); }}><h2>New training</h2><div class="form">
+      <label>Data set <select value=${dataset.name} onChange=${set("dataset")}>${datasets.map(({ name }) => html`<option value=${name}>${name}</option>`)}</select></label>
+      <label>Preset <select value=${preset} onChange=${set("preset")}>${(presets.length ? presets : [preset]).map(name => html`<option value=${name}>${name}</option>`)}</select></label>
+      <label>Name of the model <input value=${form.name} placeholder=${dataset.name} pattern="[a-z0-9][a-z0-9\\-]*" onInput=${set("name")} /></label>
+      <label>Steps <input type="number" min="1" value=${form.steps} placeholder="of the preset" onInput=${set("steps")} /></label>
+      <label class="wide">Other settings, one a line <textarea rows="2" value=${form.settings} placeholder="sequence.batch_size=16" onInput=${set("settings")} /></label>
+    </div><p class="quiet">${estimate} A training that needs more memory than a job may use is refused.</p>
+    <div class="actions"><button class="main">Train</button><${Copy} curl=${() => curl("POST", "/v1/jobs", spec)} python=${() => requests("POST", "/v1/jobs", spec)} /></div></form>`;
+}
+
+function NewEvaluation({ models, datasets, submit }) {
+  const [form, setForm] = useState({});
+  const model = form.model ?? models[0]?.name;
+  const dataset = form.dataset ?? datasets[0].name;
+  const spec = { kind: "evaluate", model, dataset };
+  const set = name => event => setForm({ ...form, [name]: event.target.value });
+  return models.length > 0 && html`<form class="card" onSubmit=${event => { event.preventDefault(); submit(spec); }}><h2>New evaluation</h2><div class="form">
+      <label>Model <select value=${model} onChange=${set("model")}>${models.map(({ name }) => html`<option value=${name}>${name}</option>`)}</select></label>
+      <label>Data set <select value=${dataset} onChange=${set("dataset")}>${datasets.map(({ name }) => html`<option value=${name}>${name}</option>`)}</select></label>
+    </div><p class="quiet">Compares the model with simple guesses on trials that training did not use, and writes a report.</p>
+    <div class="actions"><button class="main">Evaluate</button><${Copy} curl=${() => curl("POST", "/v1/jobs", spec)} python=${() => requests("POST", "/v1/jobs", spec)} /></div></form>`;
+}
+
+const STATES = { running: "good", succeeded: "good", queued: "care", failed: "bad", cancelled: "quiet" };
+
+function Jobs({ jobs, chosen }) {
+  return html`<div class="table jobs" tabindex="0" role="region" aria-label="jobs"><table><thead><tr><th scope="col">Job</th><th scope="col">Work</th><th scope="col">State</th><th scope="col">Time</th></tr></thead>
+    <tbody>${jobs.map(job => html`<tr class=${job.id === chosen ? "chosen" : ""}><td><a href=${link("train", { job: job.id })} onClick=${event => { event.preventDefault(); note({ job: job.id }); }}>${job.id}</a></td>
+      <td>${titleOf(job.spec)}</td><td class=${STATES[job.state]}>${job.state}</td><td>${job.started_unix_s ? duration((job.ended_unix_s ?? Date.now() / 1000) - job.started_unix_s) : ""}</td></tr>`)}</tbody></table></div>`;
+}
+
+// The chosen job as it goes on.
+function Watched({ id, jobs }) {
+  const { job, lines, losses } = useJob(id);
+  if (!job) return html`<p class="quiet wait">Reading ${id}…</p>`;
+  return html`<div class="watched">
+    <h2>${id}: ${titleOf(job.spec)} <span class=${STATES[job.state]}>${job.state}</span></h2>
+    <${Progress} job=${job} />
+    <div class="actions"><${Steer} job=${job} />
+      ${job.state === "succeeded" && job.spec.kind === "train" && html`<a href=${link("play", { model: job.spec.name })}>play it</a>`}
+      ${job.state === "succeeded" && ["collect", "import"].includes(job.spec.kind) && html`<a href=${link("data", { set: job.spec.name })}>open it</a>`}</div>
+    ${job.spec.kind === "train" && html`<${Curves} id=${id} losses=${losses} jobs=${jobs} />`}
+    <${Report} job=${job} />
+    <details><summary>Log</summary><${Log} lines=${lines} /></details>
+    <footer><${Copy} curl=${() => curl("GET", `/v1/jobs/${id}/events`, undefined, " -N")} python=${() => requests("GET", `/v1/jobs/${id}`)} /></footer>
+  </div>`;
+}
+
+// The losses of a stage as a line: places and values.
+const lineOf = (points, stage, name) => points.filter(point => point.stage === stage && point[name] !== null).map(point => [point.step, point[name]]);
+
+// Lines with different places as one table.
+function joined(lines) {
+  const places = [...new Set(lines.flatMap(line => line.map(([step]) => step)))].sort((one, other) => one - other);
+  return [places, ...lines.map(line => {
+    const values = new Map(line);
+    return places.map(step => values.get(step) ?? null);
+  })];
+}
+
+// The curves of a training on a log scale, and those of others over them.
+function Curves({ id, losses, jobs }) {
+  const [others, setOthers] = useState({});
+  const trainings = jobs.filter(job => job.spec.kind === "train" && job.id !== id).slice(0, 8);
+  const toggle = async other => {
+    const { [other]: known, ...rest } = others;
+    if (known) return setOthers(rest);
+    const { points } = await get(`/v1/jobs/${other}/metrics`);
+    return setOthers({ ...rest, [other]: points });
+  };
+  const stage = losses.some(point => point.stage === "sequence") ? "sequence" : "pretrain";
+  const overlaid = Object.keys(others);
+  const data = useMemo(() => joined([lineOf(losses, stage, "train"), lineOf(losses, stage, "validation"), ...overlaid.map(other => lineOf(others[other], stage, "validation"))]), [losses, others, stage]);
+  const series = [{ label: "training", color: "--quiet", width: 1 }, { label: "validation", color: "--orange", width: 2, points: true },
+    ...overlaid.map((other, place) => ({ label: `validation of ${other}`, color: COLORS[(place + 3) % COLORS.length], width: 2 }))];
+  return html`<h3>Loss, stage ${stage}</h3>
+    ${losses.length ? html`<${Plot} label="loss of the training and the validation windows" data=${data} series=${series} height=${240} x="step" log legend />` : html`<p class="quiet">No loss yet; the first comes after some steps.</p>`}
+    ${trainings.length > 0 && html`<div class="actions" role="group" aria-label="runs over this one">${trainings.map(job => html`<button class="small" aria-pressed=${Boolean(others[job.id])} onClick=${() => toggle(job.id)}>${job.id}, ${job.spec.name}</button>`)}</div>`}`;
+}
