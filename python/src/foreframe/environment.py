@@ -63,7 +63,7 @@ class Environment:
         body = client.run(calls.create_environment(scenario, seed, world))
         self.id: str = body["id"]
         #: Components of an action, with what the robot can do as their bounds.
-        self.actions: tuple[Channel, ...] = channels(body["action"], body.get("action_bounds"))
+        self.actions: tuple[Channel, ...] = channels(body["action"], body["action_bounds"])
         #: Components of a state; they have no bounds.
         self.states: tuple[Channel, ...] = channels(body["state"], [{"low": -np.inf, "high": np.inf}] * len(body["state"]))
         self.world: Mapping[str, Any] = body["world"]
