@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import base64
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Generic, TypeAlias, TypeVar
 from urllib.parse import quote
 
+import msgpack
 import numpy as np
 from numpy.typing import NDArray
 
@@ -33,28 +33,26 @@ class Call(Generic[T]):
     body: Mapping[str, Any] | None = None
     params: Mapping[str, Any] = field(default_factory=dict)
     headers: Mapping[str, str] = field(default_factory=dict)
+    #: Whether both bodies are MessagePack, because they hold images.
+    is_binary: bool = False
 
     def content(self) -> bytes | None:
-        return None if self.body is None else json.dumps(_plain(self.body)).encode()
+        if self.body is None:
+            return None
+        if self.is_binary:
+            packed: bytes = msgpack.packb(self.body, use_single_float=True)
+            return packed
+        return json.dumps(self.body).encode()
 
     def all_headers(self) -> dict[str, str]:
-        typed = {} if self.body is None else {"Content-Type": "application/json"}
-        return {**typed, "Accept": "application/json", **self.headers}
+        media_type = "application/msgpack" if self.is_binary else "application/json"
+        typed = {} if self.body is None else {"Content-Type": media_type}
+        return {**typed, "Accept": media_type, **self.headers}
 
     def result(self, content: bytes) -> T:
+        if self.is_binary:
+            return self.read(msgpack.unpackb(content))
         return self.read(json.loads(content) if content else None)
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, bytes):
-        return base64.b64encode(value).decode()
-    if isinstance(value, Mapping):
-        return {key: _plain(inner) for key, inner in value.items()}
-    return [_plain(inner) for inner in value] if isinstance(value, list) else value
-
-
-def _images(texts: Sequence[str]) -> list[bytes]:
-    return [base64.b64decode(text) for text in texts]
 
 
 def numbers(values: Any) -> Any:
@@ -100,11 +98,8 @@ def predict(
         steps=steps,
         resize=resize,
     )
-
-    def read(answer: Mapping[str, Any]) -> Prediction:
-        return Prediction.of({**answer, "frames": _images(answer["frames"])}, spec.size)
-
-    return Call("POST", f"/v1/models/{quote(name, safe='')}/predict", read, body)
+    path = f"/v1/models/{quote(name, safe='')}/predict"
+    return Call("POST", path, lambda answer: Prediction.of(answer, spec.size), body, is_binary=True)
 
 
 def rollouts(
@@ -126,7 +121,8 @@ def rollouts(
         steps=steps,
         resize=resize,
     )
-    return Call("POST", f"/v1/models/{quote(name, safe='')}/rollouts", _rollouts(spec), body)
+    path = f"/v1/models/{quote(name, safe='')}/rollouts"
+    return Call("POST", path, lambda answer: Rollouts.of(answer, spec.size), body, is_binary=True)
 
 
 def session_rollouts(
@@ -134,14 +130,7 @@ def session_rollouts(
 ) -> Call[Rollouts]:
     body = given(format="raw", plans=[numbers(plan) for plan in plans], state=numbers(state), steps=steps)
     path, headers = f"/v1/sessions/{session}/rollouts", {"x-session-token": token}
-    return Call("POST", path, _rollouts(spec), body, headers=headers)
-
-
-def _rollouts(spec: Spec) -> Callable[[Mapping[str, Any]], Rollouts]:
-    def read(answer: Mapping[str, Any]) -> Rollouts:
-        return Rollouts.of({**answer, "rollouts": [_images(rollout) for rollout in answer["rollouts"]]}, spec.size)
-
-    return read
+    return Call("POST", path, lambda answer: Rollouts.of(answer, spec.size), body, headers=headers, is_binary=True)
 
 
 def create_session(model_name: str, resize: str | None) -> Call[Mapping[str, Any]]:

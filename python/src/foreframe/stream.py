@@ -175,7 +175,12 @@ class SessionFlow:
 
     def _exchange(self, message: dict[str, Any], seq: int) -> Flow:
         """Sends a frame; gives the answer to it. If the server knows the frame already, it answers again."""
-        yield Send(msgpack.packb({**message, "seq": seq - self._first_seq}))
+        try:
+            yield Send(msgpack.packb({**message, "seq": seq - self._first_seq}))
+        except Broken:
+            # Why the server closed the socket stands in its last message; then this raises.
+            while True:
+                yield from self._receive()
         while True:
             answer = yield from self._receive()
             if answer["type"] in ("prediction", "buffering", "overtaken"):
