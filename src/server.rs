@@ -2,7 +2,7 @@
 //! handlers share, [`protocol`] the messages of a stream.
 //!
 //! The rooms in the order in which they may use each other; each uses only those before it:
-//! `config`, `http` (connections, limits, keys, problem details), `blocking`, `render_cache`, `images`, `stream` (a session and its
+//! `config`, `msgpack`, `http` (connections, limits, keys, problem details), `blocking`, `render_cache`, `images`, `stream` (a session and its
 //! WebSocket), `environments`, `state` ([`App`]), `routes` (one resource a file), `openapi`, `router`, `admin` (health checks and metrics on their own
 //! address), `serve`.
 
@@ -12,6 +12,7 @@ mod config;
 mod environments;
 mod http;
 mod images;
+mod msgpack;
 mod openapi;
 mod render_cache;
 mod router;

@@ -16,6 +16,7 @@ pub(super) mod page;
 pub(super) mod problem;
 mod rate;
 pub(super) mod requests;
+pub(super) mod structured;
 pub(super) mod task_limit;
 pub(super) mod tls;
 

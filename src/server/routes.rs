@@ -17,4 +17,5 @@ pub(super) mod rollouts;
 pub(super) mod sessions;
 pub(super) mod streams;
 
+mod bounds;
 mod picture;

@@ -15,7 +15,7 @@ use serde_json::{Value, json};
 
 use crate::fixtures::{self, moving_squares};
 use crate::process::{output, text};
-use crate::service::{HORIZON, TIMEOUT, app, context, png, post, start, with_data};
+use crate::service::{HORIZON, TIMEOUT, app, context, get, png, post, start, with_data};
 
 const SIDE: u32 = 16;
 
@@ -147,6 +147,10 @@ async fn answers_carry_expected_errors_and_warnings() {
         "action speed is 9 px/frame; in training it was 0 to 2 px/frame",
     ];
     assert_eq!(answer["warnings"], json!(expected));
+
+    let described = get(&app, "/v1/models/squares").await.json();
+    assert_eq!(described["action_bounds"], json!([{"low": 0.0, "high": 2.0}]));
+    assert_eq!(described["state_bounds"], json!([{"low": 0.5, "high": 0.5}]));
 }
 
 #[tokio::test]

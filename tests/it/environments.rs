@@ -34,6 +34,8 @@ async fn an_environment_returns_what_the_simulator_returns() {
     let body = created.json();
     let id = body["id"].as_str().unwrap();
     assert_eq!(created.headers["location"], format!("/v1/environments/{id}"));
+    let limits = &body["action_bounds"];
+    assert_eq!((&limits[0]["low"], &limits[0]["high"]), (&json!(-0.7), &json!(0.7)));
     let mut local = Environment::new(Scenario::MovingObserver, WorldConfig::default()).unwrap();
     let (first, trial) = local.reset(Some(Seed(7))).unwrap();
     assert_eq!(pixels(&body["observation"]), first.frame.pixels());

@@ -49,6 +49,7 @@ mod malformed_streams;
 mod metrics;
 mod model_cards;
 mod moving_mnist;
+mod msgpack;
 mod nn_cell;
 mod nn_fixtures;
 mod nn_flow;

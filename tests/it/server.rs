@@ -97,7 +97,7 @@ async fn the_accept_header_selects_png_or_gif() {
     assert!(gif.body.starts_with(b"GIF89a"));
     let refused = post_text(&app, PLAIN, body, "text/csv").await.detail(406);
     assert!(
-        refused.contains("application/json, image/png and image/gif"),
+        refused.contains("application/json, application/msgpack, image/png and image/gif"),
         "{refused}"
     );
 }

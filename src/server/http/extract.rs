@@ -15,10 +15,14 @@ use serde::{Deserialize, Deserializer};
 use super::body_budget;
 use super::problem::ApiError;
 
+/// The media type of `MessagePack`.
+pub(super) const MSGPACK: &str = "application/msgpack";
+
 /// A JSON body. It must be an object: serde would also accept a list of the fields' values.
 pub(in crate::server) struct Json<T>(pub(in crate::server) T);
 
-struct Object<T>(T);
+/// A value that is an object.
+pub(super) struct Object<T>(pub(super) T);
 
 impl<'de, T: Deserialize<'de>> Deserialize<'de> for Object<T> {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
@@ -79,6 +83,8 @@ impl<T: DeserializeOwned, S: Send + Sync> FromRequestParts<S> for Query<T> {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(in crate::server) enum ResponseFormat {
     Json,
+    /// As JSON, with binary images.
+    Msgpack,
     Png,
     Gif,
 }
@@ -92,13 +98,14 @@ impl ResponseFormat {
         for media_type in named {
             match media_type {
                 "application/json" | "application/*" | "*/*" | "" => return Ok(Self::Json),
+                MSGPACK => return Ok(Self::Msgpack),
                 "image/png" | "image/*" => return Ok(Self::Png),
                 "image/gif" => return Ok(Self::Gif),
                 _ => {}
             }
         }
         Err(ApiError::NotAcceptable(format!(
-            "a prediction is not available as {accept}; accept application/json, image/png and image/gif"
+            "a prediction is not available as {accept}; this server has application/json, application/msgpack, image/png and image/gif"
         )))
     }
 }

@@ -1,4 +1,4 @@
-//! Request bodies with images: JSON with base64, or a form with image files.
+//! Request bodies with images: JSON with base64, `MessagePack`, or a form with image files.
 
 use std::sync::Arc;
 
@@ -8,8 +8,9 @@ use axum::http::header;
 use serde::de::DeserializeOwned;
 
 use super::admission::Admission;
-use super::extract::{Json, too_long};
+use super::extract::too_long;
 use super::problem::ApiError;
+use super::structured::JsonOrMsgpack;
 use crate::server::config::ServerConfig;
 
 /// A list that is too long.
@@ -41,11 +42,11 @@ pub(in crate::server) trait WithFrames {
     fn push_frame(&mut self, file: Vec<u8>);
 }
 
-/// A JSON body, or a form (`multipart/form-data`): a part `request`, which is the JSON body, and a part `frames` for each
+/// A body of JSON or `MessagePack`, or a form (`multipart/form-data`): a part `request`, which is the body as JSON, and a part `frames` for each
 /// image, in order. Refused before it is read if there is no place for its prediction.
-pub(in crate::server) struct JsonOrForm<T>(pub(in crate::server) T);
+pub(in crate::server) struct BodyOrForm<T>(pub(in crate::server) T);
 
-impl<T, S> FromRequest<S> for JsonOrForm<T>
+impl<T, S> FromRequest<S> for BodyOrForm<T>
 where
     T: DeserializeOwned + WithFrames,
     S: Send + Sync,
@@ -58,7 +59,7 @@ where
         let request = Admission::from_ref(state).check(request).await?;
         let media_type = request.headers().get(header::CONTENT_TYPE);
         if !media_type.is_some_and(|media_type| media_type.as_bytes().starts_with(b"multipart/form-data")) {
-            let Json(body) = Json::from_request(request, state).await?;
+            let JsonOrMsgpack(body) = JsonOrMsgpack::from_request(request, state).await?;
             return Ok(Self(body));
         }
         let max_frames = Arc::<ServerConfig>::from_ref(state).max_frames;

@@ -9,6 +9,7 @@ use serde::{Deserialize, Serialize};
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
+use super::bounds::ChannelBounds;
 use crate::server::environments::SharedEnvironment;
 use crate::server::http::extract::{Json, Path};
 use crate::server::http::keys::Caller;
@@ -17,6 +18,7 @@ use crate::server::images::{self, ImageBytes, ImageFormat};
 use crate::server::state::App;
 use foreframe_core::nn::spec::MAX_MODEL_SIDE_PX;
 use foreframe_core::types::{Action, Channel, Seed};
+use foreframe_sim::robot::{MAX_ANGULAR_RAD_S, MAX_LINEAR_M_S};
 use foreframe_sim::{
     Environment, Observation, PlanarPose, Scenario, SimError, StepResult, TrialParameters, World, WorldConfig,
     action_channels, state_channels,
@@ -93,6 +95,8 @@ struct EnvironmentBody {
     scenario: Scenario,
     /// Components of an action, in their order.
     action: Vec<Channel>,
+    /// Lowest and highest value of each component of an action: what the robot can do.
+    action_bounds: [ChannelBounds; 2],
     /// Components of a state, in their order.
     state: Vec<Channel>,
     /// The settings of the world.
@@ -204,6 +208,7 @@ fn begin(request: &NewEnvironment) -> Result<(Environment, EnvironmentBody), Api
         id: String::new(),
         scenario: request.scenario,
         action: action_channels(),
+        action_bounds: [MAX_LINEAR_M_S, MAX_ANGULAR_RAD_S].map(ChannelBounds::symmetric),
         state: state_channels(),
         world: request.world.clone(),
         observation,

@@ -5,12 +5,14 @@ use serde::Serialize;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
+use super::bounds::ChannelBounds;
 use crate::server::http::extract::{Path, Query};
 use crate::server::http::page::Page;
 use crate::server::http::problem::ApiError;
 use crate::server::state::App;
 use foreframe_core::nn::ModelSpec;
 use foreframe_core::registry::Manifest;
+use foreframe_core::registry::calibration::ValueRange;
 use foreframe_core::types::ModelName;
 use foreframe_jobs::store::Author;
 use foreframe_jobs::versions::VersionError;
@@ -47,6 +49,13 @@ struct ModelDescription {
     active_version: u32,
     /// Frame size, context, horizon, conditioning, units and order of action and state.
     spec: ModelSpec,
+    /// Lowest and highest value of each action component in training; absent if the model is not calibrated or takes no
+    /// actions.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    action_bounds: Vec<ChannelBounds>,
+    /// The same of each state component.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    state_bounds: Vec<ChannelBounds>,
     /// Scores on data that it was not trained on.
     #[schema(value_type = Object)]
     metrics: serde_json::Value,
@@ -86,11 +95,16 @@ impl ModelDescription {
         if let Err(place) = versions.binary_search(&manifest.version) {
             versions.insert(place, manifest.version);
         }
+        let calibration = manifest.calibration.as_ref();
+        let bounds =
+            |ranges: Option<&Vec<ValueRange>>| ranges.into_iter().flatten().map(|range| (*range).into()).collect();
         Self {
             name: manifest.name.to_string(),
             versions,
             active_version: manifest.version,
             spec: manifest.spec.clone(),
+            action_bounds: bounds(calibration.map(|calibration| &calibration.actions)),
+            state_bounds: bounds(calibration.map(|calibration| &calibration.states)),
             metrics,
             lineage: Lineage {
                 dataset: manifest.dataset.name.clone(),

@@ -17,7 +17,7 @@ const REST_PERIODS: usize = 4;
 /// The threads that write predictions in that format.
 pub(super) fn threads_for(app: &App, format: ResponseFormat) -> &BlockingWork {
     match format {
-        ResponseFormat::Json => &app.predictions,
+        ResponseFormat::Json | ResponseFormat::Msgpack => &app.predictions,
         ResponseFormat::Png | ResponseFormat::Gif => app.render_cache.threads(),
     }
 }
@@ -25,7 +25,7 @@ pub(super) fn threads_for(app: &App, format: ResponseFormat) -> &BlockingWork {
 /// A copy of the context for an answer in that format: empty if the answer does not show it.
 pub(super) fn context_for(format: ResponseFormat, context: &[Frame]) -> Vec<Frame> {
     match format {
-        ResponseFormat::Json => Vec::new(),
+        ResponseFormat::Json | ResponseFormat::Msgpack => Vec::new(),
         ResponseFormat::Png | ResponseFormat::Gif => context.to_vec(),
     }
 }

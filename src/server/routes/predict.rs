@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use axum::response::{IntoResponse, Response};
+use axum::response::Response;
 use serde::{Deserialize, Serialize};
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
@@ -10,8 +10,9 @@ use utoipa_axum::routes;
 use super::picture;
 use crate::server::config::ServerConfig;
 use crate::server::http::extract::{Path, ResponseFormat};
-use crate::server::http::multipart::{JsonOrForm, WithFrames, check_count};
+use crate::server::http::multipart::{BodyOrForm, WithFrames, check_count};
 use crate::server::http::problem::{ApiError, unfit};
+use crate::server::http::structured::structured;
 use crate::server::images::{self, ImageBytes, ImageError, ImageFormat, ImageInput};
 use crate::server::state::App;
 use foreframe_core::frame::Frame;
@@ -57,7 +58,7 @@ struct PredictRequest {
 
 /// The same request as a form.
 #[derive(utoipa::ToSchema)]
-#[allow(dead_code, reason = "describes the form; `JsonOrForm` reads it")]
+#[allow(dead_code, reason = "describes the form; `BodyOrForm` reads it")]
 struct PredictForm {
     /// The image files of the context, oldest first.
     #[schema(value_type = Vec<String>, format = Binary)]
@@ -104,20 +105,21 @@ impl WithFrames for PredictRequest {
     }
 }
 
-/// Predicts the frames that follow a context. The body is JSON, or a form (`multipart/form-data`) with image files
-/// `frames` and the other fields as JSON in a part `request`. `Accept: image/png` gives a labelled contact sheet of the
+/// Predicts the frames that follow a context. The body is JSON, MessagePack with the same fields and binary images, or a form
+/// (`multipart/form-data`) with image files `frames` and the other fields as JSON in a part `request`.
+/// `Accept: application/msgpack` gives binary images, `Accept: image/png` gives a labelled contact sheet of the
 /// context and the prediction, `image/gif` an animation.
 #[utoipa::path(
     post, path = "/v1/models/{model}/predict",
-    request_body(content((PredictRequest = "application/json"), (PredictForm = "multipart/form-data"))),
+    request_body(content((PredictRequest = "application/json"), (PredictRequest = "application/msgpack"), (PredictForm = "multipart/form-data"))),
     responses(
         (status = 200, description = "The prediction", content(
-            (PredictResponse = "application/json"), (Vec<u8> = "image/png"), (Vec<u8> = "image/gif"),
+            (PredictResponse = "application/json"), (PredictResponse = "application/msgpack"), (Vec<u8> = "image/png"), (Vec<u8> = "image/gif"),
         )),
-        (status = 400, description = "Not JSON"),
+        (status = 400, description = "Not what its Content-Type says"),
         (status = 406, description = "No media type in `Accept` is supported"),
         (status = 413, description = "A body or a list exceeds its limit"),
-        (status = 415, description = "Content-Type is neither JSON nor a form"),
+        (status = 415, description = "Content-Type is neither JSON, MessagePack nor a form"),
         (status = 422, description = "Does not fit the model"),
         (status = 503, description = "Too many predictions wait"),
     )
@@ -126,7 +128,7 @@ async fn predict(
     app: App,
     Path(model): Path<String>,
     wanted: ResponseFormat,
-    JsonOrForm(request): JsonOrForm<PredictRequest>,
+    BodyOrForm(request): BodyOrForm<PredictRequest>,
 ) -> Result<Response, ApiError> {
     let model = app.predictor().active(&model)?;
     let _place = app.admission.enter()?;
@@ -290,9 +292,9 @@ fn answer(
             let period_s = manifest.spec.frame_period_s;
             picture::gif(picture::animation(seen, &rollout.frames, period_s))
         }
-        ResponseFormat::Json => {
+        ResponseFormat::Json | ResponseFormat::Msgpack => {
             let format = format.answer();
-            Ok(axum::Json(PredictResponse {
+            let body = PredictResponse {
                 model: manifest.name.to_string(),
                 version: manifest.version,
                 expected_mse: rollout.expected_mse(),
@@ -303,8 +305,8 @@ fn answer(
                 beyond_training,
                 warnings: prediction.warnings,
                 timing: prediction.timing,
-            })
-            .into_response())
+            };
+            Ok(structured(wanted, &body))
         }
     }
 }

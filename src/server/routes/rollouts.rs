@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use axum::response::{IntoResponse, Response};
+use axum::response::Response;
 use serde::{Deserialize, Serialize};
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
@@ -11,9 +11,10 @@ use super::picture;
 use super::predict;
 use super::sessions::AuthorizedSession;
 use crate::server::config::ServerConfig;
-use crate::server::http::extract::{Json, Path, ResponseFormat};
-use crate::server::http::multipart::{JsonOrForm, WithFrames, check_count};
+use crate::server::http::extract::{Path, ResponseFormat};
+use crate::server::http::multipart::{BodyOrForm, WithFrames, check_count};
 use crate::server::http::problem::ApiError;
+use crate::server::http::structured::{JsonOrMsgpack, structured};
 use crate::server::images::{self, ImageBytes, ImageFormat, ImageInput};
 use crate::server::state::App;
 use foreframe_core::frame::Frame;
@@ -108,12 +109,12 @@ impl WithFrames for RolloutRequest {
 /// Predicts a rollout for each of many plans. `Accept: image/png` gives a contact sheet with a row for each,
 /// `image/gif` an animation with all of them side by side.
 #[utoipa::path(
-    post, path = "/v1/models/{model}/rollouts", request_body = RolloutRequest,
+    post, path = "/v1/models/{model}/rollouts", request_body(content((RolloutRequest = "application/json"), (RolloutRequest = "application/msgpack"))),
     responses(
         (status = 200, description = "The rollouts", content(
-            (RolloutResponse = "application/json"), (Vec<u8> = "image/png"), (Vec<u8> = "image/gif"),
+            (RolloutResponse = "application/json"), (RolloutResponse = "application/msgpack"), (Vec<u8> = "image/png"), (Vec<u8> = "image/gif"),
         )),
-        (status = 400, description = "Not JSON"),
+        (status = 400, description = "Not what its Content-Type says"),
         (status = 406, description = "Too many for a picture, or no media type in `Accept` is supported"),
         (status = 413, description = "A body, a list or an answer exceeds its limit"),
         (status = 422, description = "Does not fit the model"),
@@ -124,7 +125,7 @@ async fn model_rollouts(
     app: App,
     Path(model): Path<String>,
     wanted: ResponseFormat,
-    JsonOrForm(request): JsonOrForm<RolloutRequest>,
+    BodyOrForm(request): BodyOrForm<RolloutRequest>,
 ) -> Result<Response, ApiError> {
     let model = app.predictor().active(&model)?;
     let (manifest, format, config) = (Arc::clone(&model.manifest), request.format, Arc::clone(&app.config));
@@ -138,10 +139,11 @@ async fn model_rollouts(
 /// Predicts a rollout for each of many plans from the session's last frame. The session does not change.
 #[utoipa::path(
     post, path = "/v1/sessions/{id}/rollouts",
+    request_body(content((SessionRolloutRequest = "application/json"), (SessionRolloutRequest = "application/msgpack"))),
     params(("id" = String, Path), ("x-session-token" = Option<String>, Header)),
     responses(
         (status = 200, description = "The rollouts", content(
-            (RolloutResponse = "application/json"), (Vec<u8> = "image/png"), (Vec<u8> = "image/gif"),
+            (RolloutResponse = "application/json"), (RolloutResponse = "application/msgpack"), (Vec<u8> = "image/png"), (Vec<u8> = "image/gif"),
         )),
         (status = 409, description = "The session has not enough frames yet"),
         (status = 413, description = "A body, a list or an answer exceeds its limit"),
@@ -153,7 +155,7 @@ async fn session_rollouts(
     app: App,
     AuthorizedSession(session): AuthorizedSession,
     wanted: ResponseFormat,
-    Json(request): Json<SessionRolloutRequest>,
+    JsonOrMsgpack(request): JsonOrMsgpack<SessionRolloutRequest>,
 ) -> Result<Response, ApiError> {
     let model = Arc::clone(&session.model);
     let (state, format) = (session.state().0, request.format);
@@ -241,11 +243,11 @@ fn answer(
             let period_s = manifest.spec.frame_period_s;
             picture::gif(picture::rollout_animation(seen, &rollout_frames(&rollouts), period_s))
         }
-        ResponseFormat::Json => {
+        ResponseFormat::Json | ResponseFormat::Msgpack => {
             let format = format.answer();
             let is_calibrated = rollouts.iter().any(|rollout| !rollout.errors.is_empty());
             let calibrated = || rollouts.iter().filter(|_| is_calibrated);
-            Ok(axum::Json(RolloutResponse {
+            let body = RolloutResponse {
                 model: manifest.name.to_string(),
                 version: manifest.version,
                 expected_mse: calibrated().map(Rollout::expected_mse).collect(),
@@ -259,8 +261,8 @@ fn answer(
                 beyond_training,
                 warnings,
                 timing,
-            })
-            .into_response())
+            };
+            Ok(structured(wanted, &body))
         }
     }
 }

@@ -1,16 +1,15 @@
 //! Reads and writes messages: `foreframe.v1.json` is text, `foreframe.v1.msgpack` is binary.
 
 use axum::extract::ws::Message;
-use serde::de::{DeserializeOwned, IgnoredAny};
-use serde::{Deserialize as _, Serialize};
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+
+use crate::server::msgpack::{self, MsgpackError};
 
 /// The sub-protocol for people and browsers.
 pub const JSON: &str = "foreframe.v1.json";
 /// The sub-protocol for robots.
 pub const MSGPACK: &str = "foreframe.v1.msgpack";
-
-/// The maximum depth of nesting in a binary message; our messages have four levels.
-const MAX_DEPTH: usize = 16;
 
 /// A sub-protocol.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -33,10 +32,19 @@ pub enum CodecError {
     Json(#[from] serde_path_to_error::Error<serde_json::Error>),
     /// Not `MessagePack`, or not a message.
     #[error("not a message of {MSGPACK}: {0}")]
-    Msgpack(#[from] serde_path_to_error::Error<rmp_serde::decode::Error>),
+    Msgpack(#[source] serde_path_to_error::Error<rmp_serde::decode::Error>),
     /// Bytes after the message.
     #[error("not a message of {}: {} follow it", .0.name(), if *.0 == Codec::Json { "letters" } else { "bytes" })]
     Trailing(Codec),
+}
+
+impl From<MsgpackError> for CodecError {
+    fn from(error: MsgpackError) -> Self {
+        match error {
+            MsgpackError::Invalid(error) => Self::Msgpack(error),
+            MsgpackError::Trailing => Self::Trailing(Codec::Msgpack),
+        }
+    }
 }
 
 impl Codec {
@@ -62,7 +70,7 @@ impl Codec {
     pub fn decode<T: DeserializeOwned>(self, message: &Message) -> Result<T, CodecError> {
         match (self, message) {
             (Self::Json, Message::Text(text)) => from_json(text),
-            (Self::Msgpack, Message::Binary(bytes)) => from_msgpack(bytes),
+            (Self::Msgpack, Message::Binary(bytes)) => Ok(msgpack::read(bytes)?),
             _ => Err(CodecError::Kind(self)),
         }
     }
@@ -75,10 +83,7 @@ impl Codec {
                 let text = serde_json::to_string(message).expect("a message that is not JSON is a bug");
                 Message::Text(text.into())
             }
-            Self::Msgpack => {
-                let bytes = rmp_serde::to_vec_named(message).expect("a message that is not MessagePack is a bug");
-                Message::Binary(bytes.into())
-            }
+            Self::Msgpack => Message::Binary(msgpack::write(message).into()),
         }
     }
 }
@@ -88,19 +93,6 @@ fn from_json<T: DeserializeOwned>(text: &str) -> Result<T, CodecError> {
     let message = serde_path_to_error::deserialize(&mut deserializer)?;
     deserializer.end().map_err(|_| CodecError::Trailing(Codec::Json))?;
     Ok(message)
-}
-
-fn from_msgpack<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, CodecError> {
-    // Borrows from the bytes, so that a length in the message allocates nothing before its bytes are there.
-    let mut deserializer = rmp_serde::Deserializer::from_read_ref(bytes);
-    deserializer.set_max_depth(MAX_DEPTH);
-    let message = serde_path_to_error::deserialize(&mut deserializer)?;
-    // Only the end of the bytes gives this error; any other byte gives a value or another error.
-    deserializer.set_max_depth(1);
-    match IgnoredAny::deserialize(&mut deserializer) {
-        Err(rmp_serde::decode::Error::InvalidMarkerRead(_)) => Ok(message),
-        _ => Err(CodecError::Trailing(Codec::Msgpack)),
-    }
 }
 
 #[cfg(test)]

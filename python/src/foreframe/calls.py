@@ -1,0 +1,205 @@
+"""The HTTP calls of the server, without a connection: what to send, and how to read the answer."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Generic, TypeAlias, TypeVar
+from urllib.parse import quote
+
+import msgpack
+import numpy as np
+from numpy.typing import NDArray
+
+from .images import FrameLike, encode_all
+from .records import Dataset, Job, LogLine, Model, Prediction, Rollouts, Spec
+
+T = TypeVar("T")
+
+#: A vector, or a list of vectors, of numbers.
+Vector: TypeAlias = "Sequence[float] | NDArray[Any]"
+Vectors: TypeAlias = "Sequence[Vector] | NDArray[Any]"
+Plans: TypeAlias = "Sequence[Vectors] | NDArray[Any]"
+
+
+@dataclass(frozen=True)
+class Call(Generic[T]):
+    """A request, and how its answer is read."""
+
+    method: str
+    path: str
+    read: Callable[[Any], T]
+    body: Mapping[str, Any] | None = None
+    params: Mapping[str, Any] = field(default_factory=dict)
+    headers: Mapping[str, str] = field(default_factory=dict)
+    #: Whether both bodies are MessagePack, because they hold images.
+    is_binary: bool = False
+
+    def content(self) -> bytes | None:
+        if self.body is None:
+            return None
+        if self.is_binary:
+            packed: bytes = msgpack.packb(self.body, use_single_float=True)
+            return packed
+        return json.dumps(self.body).encode()
+
+    def all_headers(self) -> dict[str, str]:
+        media_type = "application/msgpack" if self.is_binary else "application/json"
+        typed = {} if self.body is None else {"Content-Type": media_type}
+        return {**typed, "Accept": media_type, **self.headers}
+
+    def result(self, content: bytes) -> T:
+        if self.is_binary:
+            return self.read(msgpack.unpackb(content))
+        return self.read(json.loads(content) if content else None)
+
+
+def numbers(values: Any) -> Any:
+    """Numbers as nested lists, whatever kind of array they are in."""
+    return None if values is None else np.asarray(values, np.float64).tolist()
+
+
+def given(**fields: Any) -> dict[str, Any]:
+    """The fields that are not None."""
+    return {name: value for name, value in fields.items() if value is not None}
+
+
+def models(after: str | None) -> Call[tuple[list[Model], str | None]]:
+    return Call("GET", "/v1/models", _page("models", Model.of), params=given(after=after))
+
+
+def model(name: str) -> Call[Model]:
+    return Call("GET", f"/v1/models/{quote(name, safe='')}", Model.of)
+
+
+def activate(name: str, version: int) -> Call[Model]:
+    return Call("POST", f"/v1/models/{quote(name, safe='')}/versions/{version}/activate", Model.of)
+
+
+def predict(
+    name: str,
+    spec: Spec,
+    frames: Sequence[FrameLike] | NDArray[np.uint8],
+    *,
+    actions: Vectors | None,
+    state: Vector | None,
+    plan: Vectors | None,
+    steps: int | None,
+    resize: str | None,
+) -> Call[Prediction]:
+    image_format, images = encode_all(frames, spec.size)
+    body = given(
+        frames=images,
+        format=image_format,
+        actions=numbers(actions),
+        state=numbers(state),
+        plan=numbers(plan),
+        steps=steps,
+        resize=resize,
+    )
+    path = f"/v1/models/{quote(name, safe='')}/predict"
+    return Call("POST", path, lambda answer: Prediction.of(answer, spec.size), body, is_binary=True)
+
+
+def rollouts(
+    name: str,
+    spec: Spec,
+    frames: Sequence[FrameLike] | NDArray[np.uint8],
+    plans: Plans,
+    *,
+    state: Vector | None,
+    steps: int | None,
+    resize: str | None,
+) -> Call[Rollouts]:
+    image_format, images = encode_all(frames, spec.size)
+    body = given(
+        frames=images,
+        format=image_format,
+        plans=[numbers(plan) for plan in plans],
+        state=numbers(state),
+        steps=steps,
+        resize=resize,
+    )
+    path = f"/v1/models/{quote(name, safe='')}/rollouts"
+    return Call("POST", path, lambda answer: Rollouts.of(answer, spec.size), body, is_binary=True)
+
+
+def session_rollouts(
+    session: str, token: str, spec: Spec, plans: Plans, *, state: Vector | None, steps: int | None
+) -> Call[Rollouts]:
+    body = given(format="raw", plans=[numbers(plan) for plan in plans], state=numbers(state), steps=steps)
+    path, headers = f"/v1/sessions/{session}/rollouts", {"x-session-token": token}
+    return Call("POST", path, lambda answer: Rollouts.of(answer, spec.size), body, headers=headers, is_binary=True)
+
+
+def create_session(model_name: str, resize: str | None) -> Call[Mapping[str, Any]]:
+    return Call("POST", "/v1/sessions", dict, given(model=model_name, format="raw", resize=resize))
+
+
+def delete_session(session: str, token: str) -> Call[None]:
+    return Call("DELETE", f"/v1/sessions/{session}", _nothing, headers={"x-session-token": token})
+
+
+def datasets(after: str | None) -> Call[tuple[list[Dataset], str | None]]:
+    return Call("GET", "/v1/datasets", _page("datasets", Dataset.of), params=given(after=after))
+
+
+def dataset(name: str) -> Call[Dataset]:
+    return Call("GET", f"/v1/datasets/{quote(name, safe='')}", Dataset.of)
+
+
+def delete_dataset(name: str) -> Call[None]:
+    return Call("DELETE", f"/v1/datasets/{quote(name, safe='')}", _nothing)
+
+
+def jobs(kind: str | None, state: str | None, limit: int | None) -> Call[list[Job]]:
+    read = _page("jobs", Job.of)
+    return Call("GET", "/v1/jobs", lambda body: read(body)[0], params=given(kind=kind, state=state, limit=limit))
+
+
+def job(job_id: str) -> Call[Job]:
+    return Call("GET", f"/v1/jobs/{quote(job_id, safe='')}", Job.of)
+
+
+def submit(spec: Mapping[str, Any], idempotency_key: str | None) -> Call[Job]:
+    headers = {} if idempotency_key is None else {"Idempotency-Key": idempotency_key}
+    return Call("POST", "/v1/jobs", Job.of, given(**spec), headers=headers)
+
+
+def change_job(job_id: str, change: str) -> Call[Job]:
+    return Call("POST", f"/v1/jobs/{quote(job_id, safe='')}/{change}", Job.of)
+
+
+def logs(job_id: str, after: int) -> Call[list[LogLine]]:
+    def read(body: Mapping[str, Any]) -> list[LogLine]:
+        return [LogLine.of(line) for line in body["lines"]]
+
+    return Call("GET", f"/v1/jobs/{quote(job_id, safe='')}/logs", read, params={"after": after})
+
+
+def create_environment(scenario: str, seed: int, world: Mapping[str, Any] | None) -> Call[Mapping[str, Any]]:
+    return Call("POST", "/v1/environments", dict, given(scenario=scenario, seed=seed, world=world))
+
+
+def reset_environment(environment: str, seed: int | None) -> Call[Mapping[str, Any]]:
+    return Call("POST", f"/v1/environments/{environment}/reset", dict, given(seed=seed))
+
+
+def step_environment(environment: str, action: Vector) -> Call[Mapping[str, Any]]:
+    return Call("POST", f"/v1/environments/{environment}/step", dict, {"action": numbers(action)})
+
+
+def delete_environment(environment: str) -> Call[None]:
+    return Call("DELETE", f"/v1/environments/{environment}", _nothing)
+
+
+def _page(name: str, of: Callable[[Mapping[str, Any]], T]) -> Callable[[Any], tuple[list[T], str | None]]:
+    def read(body: Mapping[str, Any]) -> tuple[list[T], str | None]:
+        return [of(entry) for entry in body[name]], body.get("next")
+
+    return read
+
+
+def _nothing(_: Any) -> None:
+    return None

@@ -1,0 +1,448 @@
+"""The client: one method for each call of the server. `AsyncClient` has the same methods as coroutines."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable, Mapping, Sequence
+from types import TracebackType
+from typing import Any, TypeVar
+
+import httpx
+import numpy as np
+from numpy.typing import NDArray
+
+from . import calls
+from .calls import Call, Plans, Vector, Vectors
+from .environment import Environment
+from .errors import ConnectionFailed, JobFailed, api_error
+from .events import EventReader
+from .images import FrameLike
+from .records import Dataset, Job, LogLine, Model, Prediction, Rollouts, Spec
+from .session import AsyncSession, Session
+
+T = TypeVar("T")
+
+DEFAULT_URL = "http://127.0.0.1:8642"
+#: How long to wait before the events of a job are read again after a break, in seconds.
+EVENTS_PAUSE_S = 1.0
+
+
+def _unreachable(url: str, error: Exception) -> ConnectionFailed:
+    return ConnectionFailed(f"no server answers at {url} ({error}); start one with: foreframe serve")
+
+
+def _result(call: Call[T], response: httpx.Response) -> T:
+    if response.status_code >= 400:
+        raise api_error(response.status_code, response.headers, response.content)
+    return call.result(response.content)
+
+
+def _authorization(key: str | None) -> dict[str, str]:
+    return {} if key is None else {"Authorization": f"Bearer {key}"}
+
+
+class _Specs:
+    """The specs of models, so that a prediction needs one request."""
+
+    def __init__(self) -> None:
+        self._known: dict[str, tuple[int, Spec]] = {}
+
+    def get(self, name: str) -> Spec | None:
+        known = self._known.get(name)
+        return known[1] if known else None
+
+    def put(self, model: Model) -> Spec:
+        self._known[model.name] = (model.active_version, model.spec)
+        return model.spec
+
+    def check(self, name: str, version: int) -> None:
+        """Forgets a model of which another version has answered."""
+        if name in self._known and self._known[name][0] != version:
+            del self._known[name]
+
+    def forget(self, name: str) -> None:
+        self._known.pop(name, None)
+
+
+class Client:
+    """A server. May be used by several threads at once.
+
+    ``key``: an API key, if the server asks for one. ``timeout_s``: for one answer.
+    """
+
+    def __init__(self, url: str = DEFAULT_URL, *, key: str | None = None, timeout_s: float = 30.0) -> None:
+        self.url = url.rstrip("/")
+        self.key = key
+        self._http = httpx.Client(base_url=self.url, headers=_authorization(key), timeout=timeout_s)
+        self._specs = _Specs()
+
+    def __enter__(self) -> Client:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Closes the connections."""
+        self._http.close()
+
+    def run(self, call: Call[T]) -> T:
+        """Makes a call. Raises ApiError or ConnectionFailed."""
+        try:
+            response = self._http.request(
+                call.method,
+                call.path,
+                params=dict(call.params),
+                content=call.content(),
+                headers=call.all_headers(),
+            )
+        except httpx.TransportError as error:
+            raise _unreachable(self.url, error) from error
+        return _result(call, response)
+
+    def spec(self, model: str) -> Spec:
+        """What a model takes and gives; asked for once."""
+        return self._specs.get(model) or self._specs.put(self.model(model))
+
+    def predict(
+        self,
+        model: str,
+        frames: Sequence[FrameLike] | NDArray[np.uint8],
+        *,
+        actions: Vectors | None = None,
+        state: Vector | None = None,
+        plan: Vectors | None = None,
+        steps: int | None = None,
+        resize: str | None = None,
+    ) -> Prediction:
+        """Predicts the frames after ``frames``, the model's context, oldest first.
+
+        ``plan``: the future actions; without it, the last of ``actions`` is repeated. ``state``: at the last frame.
+        ``resize``: ``crop``, ``letterbox`` or ``stretch``, for frames of another size.
+        """
+        call = calls.predict(
+            model, self.spec(model), frames, actions=actions, state=state, plan=plan, steps=steps, resize=resize
+        )
+        prediction = self._of_known_spec(model, call)
+        self._specs.check(model, prediction.version)
+        return prediction
+
+    def rollouts(
+        self,
+        model: str,
+        frames: Sequence[FrameLike] | NDArray[np.uint8],
+        plans: Plans,
+        *,
+        state: Vector | None = None,
+        steps: int | None = None,
+        resize: str | None = None,
+    ) -> Rollouts:
+        """Predicts the frames of each of ``plans`` ``[plans, steps, action]`` from one context."""
+        call = calls.rollouts(model, self.spec(model), frames, plans, state=state, steps=steps, resize=resize)
+        found = self._of_known_spec(model, call)
+        self._specs.check(model, found.version)
+        return found
+
+    def _of_known_spec(self, model: str, call: Call[T]) -> T:
+        try:
+            return self.run(call)
+        except Exception:
+            # Another version may have become active, with other frames.
+            self._specs.forget(model)
+            raise
+
+    def session(self, model: str, *, resize: str | None = None, reconnect_s: float = 30.0) -> Session:
+        """A session: send frame after frame, get a prediction after each. See :class:`Session`."""
+        return Session(self, model, resize=resize, reconnect_s=reconnect_s)
+
+    def models(self) -> list[Model]:
+        """All models."""
+        return self._all(calls.models)
+
+    def model(self, name: str) -> Model:
+        """One model."""
+        return self.run(calls.model(name))
+
+    def activate(self, model: str, version: int) -> Model:
+        """Makes a version the active one."""
+        self._specs.forget(model)
+        return self.run(calls.activate(model, version))
+
+    def datasets(self) -> list[Dataset]:
+        """All data sets."""
+        return self._all(calls.datasets)
+
+    def dataset(self, name: str) -> Dataset:
+        """One data set."""
+        return self.run(calls.dataset(name))
+
+    def delete_dataset(self, name: str) -> None:
+        """Deletes a data set."""
+        self.run(calls.delete_dataset(name))
+
+    def _all(self, page: Callable[[str | None], Call[tuple[list[T], str | None]]]) -> list[T]:
+        found, after = self.run(page(None))
+        while after is not None:
+            more, after = self.run(page(after))
+            found += more
+        return found
+
+    def jobs(self, *, kind: str | None = None, state: str | None = None, limit: int | None = None) -> list[Job]:
+        """The newest jobs."""
+        return self.run(calls.jobs(kind, state, limit))
+
+    def job(self, job_id: str) -> Job:
+        """A job and its progress."""
+        return self.run(calls.job(job_id))
+
+    def submit(self, spec: Mapping[str, Any], *, idempotency_key: str | None = None) -> Job:
+        """Queues a job: ``{"kind": "train", "name": …, "preset": …, "dataset": …}``; /docs on the server lists all fields."""
+        return self.run(calls.submit(spec, idempotency_key))
+
+    def cancel(self, job_id: str) -> Job:
+        """Cancels a job."""
+        return self.run(calls.change_job(job_id, "cancel"))
+
+    def resume(self, job_id: str) -> Job:
+        """Resumes a failed or cancelled job."""
+        return self.run(calls.change_job(job_id, "resume"))
+
+    def logs(self, job_id: str, *, after: int = 0) -> list[LogLine]:
+        """Up to 1000 lines of a job's log."""
+        return self.run(calls.logs(job_id, after))
+
+    def wait(
+        self,
+        job: Job | str,
+        *,
+        on_progress: Callable[[Job], None] | None = None,
+        on_log: Callable[[LogLine], None] | None = None,
+        timeout_s: float | None = None,
+    ) -> Job:
+        """Waits until a job has succeeded. ``on_progress`` gets the job whenever it changes, ``on_log`` each line of its log.
+
+        Raises JobFailed if it failed or was cancelled, TimeoutError.
+        """
+        job_id = job if isinstance(job, str) else job.id
+        watched = _Watched(job_id, on_progress, on_log, timeout_s)
+        while True:
+            try:
+                with self._http.stream("GET", watched.path, headers=watched.headers(), timeout=watched.timeout()) as response:
+                    if response.status_code >= 400:
+                        raise api_error(response.status_code, response.headers, response.read())
+                    for line in response.iter_lines():
+                        watched.line(line)
+            except httpx.TransportError as error:
+                if watched.is_late() or not _is_break(error):
+                    raise _unreachable(self.url, error) from error
+            if watched.over is not None:
+                return watched.over
+            watched.check_time()
+            time.sleep(EVENTS_PAUSE_S)
+
+    def environment(self, scenario: str, *, seed: int = 0, world: Mapping[str, Any] | None = None) -> Environment:
+        """A simulated robot on the server: ``static-observer``, ``moving-observer`` or ``crowded``."""
+        return Environment(self, scenario, seed, world)
+
+
+def _is_break(error: Exception) -> bool:
+    """Whether a stream of events broke, and the server may continue it."""
+    return isinstance(error, (httpx.RemoteProtocolError, httpx.ReadError, httpx.ReadTimeout, httpx.ConnectError))
+
+
+class _Watched:
+    """A job whose events are read."""
+
+    def __init__(
+        self,
+        job_id: str,
+        on_progress: Callable[[Job], None] | None,
+        on_log: Callable[[LogLine], None] | None,
+        timeout_s: float | None,
+    ) -> None:
+        self.path = f"/v1/jobs/{job_id}/events"
+        self.over: Job | None = None
+        self._job_id = job_id
+        self._on_progress = on_progress
+        self._on_log = on_log
+        self._deadline = None if timeout_s is None else time.monotonic() + timeout_s
+        self._events = EventReader()
+        self._last_event = time.monotonic()
+
+    def headers(self) -> dict[str, str]:
+        last = self._events.last_id
+        return {} if last is None else {"Last-Event-ID": last}
+
+    def timeout(self) -> float:
+        # The server sends a comment every 15 s.
+        return 60.0 if self._deadline is None else min(60.0, max(0.1, self._deadline - time.monotonic()))
+
+    def line(self, line: str) -> None:
+        self._last_event = time.monotonic()
+        self.check_time()
+        event = self._events.line(line)
+        if event is None:
+            return
+        name, body = event
+        if name == "log" and self._on_log:
+            self._on_log(LogLine.of(body))
+        if name == "job":
+            job = Job.of(body)
+            if self._on_progress:
+                self._on_progress(job)
+            if job.state in ("failed", "cancelled"):
+                raise JobFailed(job)
+            self.over = job if job.is_over else None
+
+    def check_time(self) -> None:
+        if self._deadline is not None and time.monotonic() >= self._deadline:
+            raise TimeoutError(f"{self._job_id} has not ended in time")
+
+    def is_late(self) -> bool:
+        """Whether the server has been away for too long."""
+        return time.monotonic() - self._last_event > 60.0
+
+
+class AsyncClient:
+    """As :class:`Client`, with coroutines."""
+
+    def __init__(self, url: str = DEFAULT_URL, *, key: str | None = None, timeout_s: float = 30.0) -> None:
+        self.url = url.rstrip("/")
+        self.key = key
+        self._http = httpx.AsyncClient(base_url=self.url, headers=_authorization(key), timeout=timeout_s)
+        self._specs = _Specs()
+
+    async def __aenter__(self) -> AsyncClient:
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None
+    ) -> None:
+        await self.close()
+
+    async def close(self) -> None:
+        """Closes the connections."""
+        await self._http.aclose()
+
+    async def run(self, call: Call[T]) -> T:
+        """Makes a call. Raises ApiError or ConnectionFailed."""
+        try:
+            response = await self._http.request(
+                call.method,
+                call.path,
+                params=dict(call.params),
+                content=call.content(),
+                headers=call.all_headers(),
+            )
+        except httpx.TransportError as error:
+            raise _unreachable(self.url, error) from error
+        return _result(call, response)
+
+    async def spec(self, model: str) -> Spec:
+        """What a model takes and gives; asked for once."""
+        return self._specs.get(model) or self._specs.put(await self.model(model))
+
+    async def predict(
+        self,
+        model: str,
+        frames: Sequence[FrameLike] | NDArray[np.uint8],
+        *,
+        actions: Vectors | None = None,
+        state: Vector | None = None,
+        plan: Vectors | None = None,
+        steps: int | None = None,
+        resize: str | None = None,
+    ) -> Prediction:
+        """As :meth:`Client.predict`."""
+        spec = await self.spec(model)
+        call = calls.predict(model, spec, frames, actions=actions, state=state, plan=plan, steps=steps, resize=resize)
+        prediction = await self._of_known_spec(model, call)
+        self._specs.check(model, prediction.version)
+        return prediction
+
+    async def rollouts(
+        self,
+        model: str,
+        frames: Sequence[FrameLike] | NDArray[np.uint8],
+        plans: Plans,
+        *,
+        state: Vector | None = None,
+        steps: int | None = None,
+        resize: str | None = None,
+    ) -> Rollouts:
+        """As :meth:`Client.rollouts`."""
+        spec = await self.spec(model)
+        call = calls.rollouts(model, spec, frames, plans, state=state, steps=steps, resize=resize)
+        found = await self._of_known_spec(model, call)
+        self._specs.check(model, found.version)
+        return found
+
+    async def _of_known_spec(self, model: str, call: Call[T]) -> T:
+        try:
+            return await self.run(call)
+        except Exception:
+            self._specs.forget(model)
+            raise
+
+    def session(self, model: str, *, resize: str | None = None, reconnect_s: float = 30.0) -> AsyncSession:
+        """As :meth:`Client.session`."""
+        return AsyncSession(self, model, resize=resize, reconnect_s=reconnect_s)
+
+    async def models(self) -> list[Model]:
+        """All models."""
+        return await self._all(calls.models)
+
+    async def model(self, name: str) -> Model:
+        """One model."""
+        return await self.run(calls.model(name))
+
+    async def datasets(self) -> list[Dataset]:
+        """All data sets."""
+        return await self._all(calls.datasets)
+
+    async def _all(self, page: Callable[[str | None], Call[tuple[list[T], str | None]]]) -> list[T]:
+        found, after = await self.run(page(None))
+        while after is not None:
+            more, after = await self.run(page(after))
+            found += more
+        return found
+
+    async def job(self, job_id: str) -> Job:
+        """A job and its progress."""
+        return await self.run(calls.job(job_id))
+
+    async def submit(self, spec: Mapping[str, Any], *, idempotency_key: str | None = None) -> Job:
+        """As :meth:`Client.submit`."""
+        return await self.run(calls.submit(spec, idempotency_key))
+
+    async def cancel(self, job_id: str) -> Job:
+        """Cancels a job."""
+        return await self.run(calls.change_job(job_id, "cancel"))
+
+    async def wait(
+        self,
+        job: Job | str,
+        *,
+        on_progress: Callable[[Job], None] | None = None,
+        on_log: Callable[[LogLine], None] | None = None,
+        timeout_s: float | None = None,
+    ) -> Job:
+        """As :meth:`Client.wait`."""
+        job_id = job if isinstance(job, str) else job.id
+        watched = _Watched(job_id, on_progress, on_log, timeout_s)
+        while True:
+            try:
+                stream = self._http.stream("GET", watched.path, headers=watched.headers(), timeout=watched.timeout())
+                async with stream as response:
+                    if response.status_code >= 400:
+                        raise api_error(response.status_code, response.headers, await response.aread())
+                    async for line in response.aiter_lines():
+                        watched.line(line)
+            except httpx.TransportError as error:
+                if watched.is_late() or not _is_break(error):
+                    raise _unreachable(self.url, error) from error
+            if watched.over is not None:
+                return watched.over
+            watched.check_time()
+            await asyncio.sleep(EVENTS_PAUSE_S)

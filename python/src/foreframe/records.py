@@ -1,0 +1,288 @@
+"""What the server answers, as typed records."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .images import Gray, decode_all
+
+Floats = NDArray[np.float32]
+#: Standard deviations from the mean that bound a channel whose range the server does not tell.
+ASSUMED_DEVIATIONS = 3.0
+
+
+@dataclass(frozen=True)
+class Channel:
+    """A component of an action or a state."""
+
+    name: str
+    unit: str
+    #: Lowest and highest value in training; mean ± 3 standard deviations if the model is not calibrated.
+    low: float
+    high: float
+    mean: float = 0.0
+    std: float = 1.0
+
+
+@dataclass(frozen=True)
+class Spec:
+    """What a model takes and gives."""
+
+    width: int
+    height: int
+    #: Seconds between two frames.
+    period_s: float
+    #: Frames that a prediction needs.
+    context: int
+    #: Frames that it was trained to predict.
+    horizon: int
+    #: ``none``, ``action``, ``state`` or ``state-action``.
+    conditioning: str
+    actions: tuple[Channel, ...]
+    states: tuple[Channel, ...]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width of a frame."""
+        return self.height, self.width
+
+    @property
+    def takes_actions(self) -> bool:
+        return "action" in self.conditioning
+
+    @property
+    def takes_state(self) -> bool:
+        return "state" in self.conditioning
+
+    @classmethod
+    def of(cls, spec: Mapping[str, Any], bounds: Mapping[str, Any] | None = None) -> Spec:
+        bounds = bounds or {}
+        return cls(
+            width=spec["frame_width_px"],
+            height=spec["frame_height_px"],
+            period_s=spec["frame_period_s"],
+            context=spec["context"],
+            horizon=spec["horizon"],
+            conditioning=spec["conditioning"],
+            actions=channels(spec["actions"], bounds.get("action_bounds")),
+            states=channels(spec["states"], bounds.get("state_bounds")),
+        )
+
+
+def channels(described: Sequence[Mapping[str, Any]], bounds: Sequence[Mapping[str, float]] | None) -> tuple[Channel, ...]:
+    def channel(index: int, known: Mapping[str, Any]) -> Channel:
+        mean, std = known.get("mean", 0.0), known.get("std", 1.0)
+        assumed = {"low": mean - ASSUMED_DEVIATIONS * std, "high": mean + ASSUMED_DEVIATIONS * std}
+        range_ = bounds[index] if bounds else assumed
+        return Channel(known["name"], known["unit"], range_["low"], range_["high"], mean, std)
+
+    return tuple(channel(index, known) for index, known in enumerate(described))
+
+
+@dataclass(frozen=True)
+class Model:
+    """A model of the server."""
+
+    name: str
+    versions: tuple[int, ...]
+    active_version: int
+    spec: Spec
+    metrics: Mapping[str, Any]
+    lineage: Mapping[str, Any]
+
+    @classmethod
+    def of(cls, body: Mapping[str, Any]) -> Model:
+        return cls(
+            name=body["name"],
+            versions=tuple(body["versions"]),
+            active_version=body["active_version"],
+            spec=Spec.of(body["spec"], body),
+            metrics=body["metrics"],
+            lineage=body["lineage"],
+        )
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Predicted frames, and how far they can be trusted."""
+
+    model: str
+    version: int
+    #: ``[steps, height, width]``: t+1, t+2, ….
+    frames: Gray
+    #: Mean squared error to expect of each frame, intensities 0 to 1; empty if the model is not calibrated.
+    expected_mse: Floats
+    #: ``[steps, 2]``: the 90 % band of these errors.
+    mse_band_90: Floats
+    #: How unlike the training data the context is, 0 to 1; None if the model is not calibrated.
+    novelty: float | None
+    #: For each frame, whether it is beyond what the model was trained for.
+    beyond_training: NDArray[np.bool_]
+    #: Actions and states out of the range of the training.
+    warnings: tuple[str, ...]
+    #: Milliseconds in the server's queue and in the model.
+    queue_ms: float
+    compute_ms: float
+
+    @classmethod
+    def of(cls, body: Mapping[str, Any], size: tuple[int, int]) -> Prediction:
+        frames = decode_all(body["frames"], body["format"], size)
+        return cls(frames=frames, **_trust(body, len(frames)))
+
+
+@dataclass(frozen=True)
+class Rollouts:
+    """The predicted frames of each plan."""
+
+    model: str
+    version: int
+    #: ``[plans, steps, height, width]``.
+    frames: Gray
+    #: ``[plans, steps]``; empty if the model is not calibrated.
+    expected_mse: Floats
+    #: ``[plans, steps, 2]``.
+    mse_band_90: Floats
+    novelty: float | None
+    beyond_training: NDArray[np.bool_]
+    warnings: tuple[str, ...]
+    queue_ms: float
+    compute_ms: float
+
+    @classmethod
+    def of(cls, body: Mapping[str, Any], size: tuple[int, int]) -> Rollouts:
+        images = [image for rollout in body["rollouts"] for image in rollout]
+        steps = len(body["rollouts"][0]) if body["rollouts"] else 0
+        frames = decode_all(images, body["format"], size).reshape(-1, steps, *size)
+        return cls(frames=frames, **_trust(body, steps))
+
+    def best(self, cost: Callable[[Gray], float]) -> int:
+        """The number of the plan with the least cost; ``cost`` takes the frames ``[steps, height, width]`` of a plan."""
+        return int(np.argmin([cost(frames) for frames in self.frames]))
+
+
+def _trust(body: Mapping[str, Any], steps: int) -> dict[str, Any]:
+    timing = body["timing"]
+    return {
+        "model": body["model"],
+        "version": body["version"],
+        "expected_mse": np.asarray(body.get("expected_mse", []), np.float32),
+        "mse_band_90": np.asarray(body.get("mse_band_90", []), np.float32),
+        "novelty": body.get("novelty"),
+        "beyond_training": np.asarray(body.get("beyond_training") or [False] * steps, bool),
+        "warnings": tuple(body.get("warnings", ())),
+        "queue_ms": timing["queue_us"] / 1000,
+        "compute_ms": timing["compute_us"] / 1000,
+    }
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The answer to a frame of a session."""
+
+    #: The number of the frame, from 0. It counts on when the connection breaks.
+    seq: int
+    #: The frame's time, echoed.
+    timestamp_us: int
+    #: None while the context is not full.
+    prediction: Prediction | None
+    #: Frames in the context, and frames that it takes.
+    have: int
+    need: int
+    #: Whether the server had lost the session, so that the last frames were sent again before this one.
+    replayed: bool = False
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """A data set of the server."""
+
+    name: str
+    title: str
+    episodes: int
+    frames: int
+    width: int
+    height: int
+    period_s: float
+    action_names: tuple[str, ...]
+    state_names: tuple[str, ...]
+    content_hash: str
+    scenario: str | None
+    has_masks: bool
+
+    @classmethod
+    def of(cls, body: Mapping[str, Any]) -> Dataset:
+        return cls(
+            name=body["name"],
+            title=body["title"],
+            episodes=body["episodes"],
+            frames=body["frames"],
+            width=body["frame_width_px"],
+            height=body["frame_height_px"],
+            period_s=body["frame_period_s"],
+            action_names=tuple(channel["name"] for channel in body["actions"]),
+            state_names=tuple(channel["name"] for channel in body["states"]),
+            content_hash=body["content_hash"],
+            scenario=body.get("scenario"),
+            has_masks=body["has_masks"],
+        )
+
+
+@dataclass(frozen=True)
+class Job:
+    """A job: a collection, an import, a training or an evaluation."""
+
+    id: str
+    #: ``collect``, ``import``, ``train`` or ``evaluate``.
+    kind: str
+    #: ``queued``, ``running``, ``succeeded``, ``failed`` or ``cancelled``.
+    state: str
+    done: int
+    total: int
+    message: str
+    #: Seconds until it ends, if known.
+    remaining_s: float | None
+    train_loss: float | None
+    validation_loss: float | None
+    error: str | None
+    result: Mapping[str, Any] = field(default_factory=dict)
+    spec: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def is_over(self) -> bool:
+        return self.state in ("succeeded", "failed", "cancelled")
+
+    @classmethod
+    def of(cls, body: Mapping[str, Any]) -> Job:
+        progress, losses = body["progress"], body["losses"]
+        return cls(
+            id=body["id"],
+            kind=body["spec"]["kind"],
+            state=body["state"],
+            done=progress["done"],
+            total=progress["total"],
+            message=progress["message"],
+            remaining_s=progress.get("remaining_s"),
+            train_loss=losses.get("train"),
+            validation_loss=losses.get("validation"),
+            error=body.get("error"),
+            result=body.get("result") or {},
+            spec=body["spec"],
+        )
+
+
+@dataclass(frozen=True)
+class LogLine:
+    """A line of a job's log."""
+
+    seq: int
+    unix_s: float
+    line: str
+
+    @classmethod
+    def of(cls, body: Mapping[str, Any]) -> LogLine:
+        return cls(body["seq"], body["unix_s"], body["line"])

@@ -1,0 +1,275 @@
+"""The stream of a session without a socket: what happens in which order. Sessions perform the operations."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Generator, Mapping
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+from urllib.parse import quote
+
+import msgpack
+
+from . import calls
+from .calls import Call, Plans, Vector, Vectors, given, numbers
+from .errors import ApiError, ConnectionFailed, StreamClosed, StreamError, Unavailable
+from .images import FrameLike, encode
+from .records import Answer, Prediction, Spec
+
+SUBPROTOCOL = "foreframe.v1.msgpack"
+#: The pauses between two attempts to connect, in seconds.
+FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.1, 2.0
+#: The server closes a stream for good only for these reasons.
+FINAL_REASONS = frozenset({"replaced", "deleted", "revoked", "too_long"})
+
+
+@dataclass(frozen=True)
+class Open:
+    """Opens the socket."""
+
+    path: str
+
+
+@dataclass(frozen=True)
+class Shut:
+    """Closes the socket, if one is open."""
+
+
+@dataclass(frozen=True)
+class Send:
+    """Sends a binary message."""
+
+    message: bytes
+
+
+@dataclass(frozen=True)
+class Receive:
+    """Receives a binary message."""
+
+
+@dataclass(frozen=True)
+class Pause:
+    """Waits."""
+
+    seconds: float
+
+
+#: What a session performs. A call gives its answer, `Receive` the message.
+Operation: TypeAlias = "Open | Shut | Send | Receive | Pause | Call[Any]"
+Flow: TypeAlias = Generator[Operation, Any, Any]
+
+
+class Broken(Exception):
+    """The socket broke, or could not be opened now."""
+
+    def __init__(self, why: str, retry_after_s: float = 0.0) -> None:
+        super().__init__(why)
+        self.retry_after_s = retry_after_s
+
+
+class SessionFlow:
+    """A session that survives its sockets, and its server.
+
+    The server keeps a session for a while after its socket closed. If it lost the session (it restarted, or the client was
+    away for too long), a new one is opened and the last frames of the context are sent again, so that the next prediction
+    is the same. Frames are numbered by ``seq``, which counts on; the server's own numbers begin at 0 in each new session.
+    """
+
+    def __init__(self, model: str, resize: str | None, reconnect_s: float) -> None:
+        self.spec: Spec | None = None
+        self.version = 0
+        #: Which frame is the next.
+        self.next_seq = 0
+        self._model = model
+        self._resize = resize
+        self._reconnect_s = reconnect_s
+        self._id = ""
+        self._token = ""
+        self._is_open = False
+        self._is_closed = False
+        #: The number of the frame that the server counts as 0.
+        self._first_seq = 0
+        self._replayed = False
+        #: The last frames that were answered.
+        self._context: deque[dict[str, Any]] = deque()
+
+    @property
+    def identity(self) -> tuple[str, str]:
+        """The session's id and token on the server; empty before it is open."""
+        return self._id, self._token
+
+    def open(self) -> Flow:
+        """Connects, if it is not connected."""
+        deadline, pause = time.monotonic() + self._reconnect_s, FIRST_PAUSE_S
+        while not self._is_open:
+            try:
+                yield from self._connect()
+            except Broken as error:
+                pause = yield from self._wait(error, deadline, pause)
+
+    def step(
+        self,
+        frame: FrameLike,
+        action: Vector | None,
+        state: Vector | None,
+        plan: Vectors | None,
+        steps: int | None,
+        timestamp_us: int | None,
+    ) -> Flow:
+        """Sends a frame, gives its Answer."""
+        yield from self.open()
+        assert self.spec is not None
+        image_format, image = encode(frame, self.spec.size)
+        message: dict[str, Any] = {
+            "type": "frame",
+            "timestamp_us": time.time_ns() // 1000 if timestamp_us is None else timestamp_us,
+            "image": image,
+            "format": image_format,
+            **given(action=numbers(action), state=numbers(state), plan=numbers(plan), steps=steps),
+        }
+        self._replayed = False
+        answer = yield from self._answered(message)
+        self._context.append(message)
+        while len(self._context) > self.spec.context:
+            self._context.popleft()
+        self.next_seq += 1
+        return self._read(answer)
+
+    def rollouts(self, plans: Plans, state: Vector | None, steps: int | None) -> Flow:
+        """The Rollouts from the last frame."""
+        for is_last in (False, True):
+            yield from self.open()
+            assert self.spec is not None
+            try:
+                found = yield calls.session_rollouts(*self.identity, self.spec, plans, state=state, steps=steps)
+                return found
+            except ApiError as error:
+                if error.status != 404 or is_last:
+                    raise
+                # The server lost the session, and the socket has not broken yet.
+                self._is_open = False
+
+    def close(self) -> Flow:
+        """Ends the session on the server, if it can be reached."""
+        self._is_closed = True
+        yield Shut()
+        if self._id:
+            try:
+                yield calls.delete_session(*self.identity)
+            except (ApiError, ConnectionFailed):
+                # It is gone already, or ends by itself.
+                pass
+
+    def _answered(self, message: dict[str, Any]) -> Flow:
+        deadline, pause = time.monotonic() + self._reconnect_s, FIRST_PAUSE_S
+        while True:
+            try:
+                if not self._is_open:
+                    yield from self._connect()
+                answer = yield from self._exchange(message, self.next_seq)
+                return answer
+            except Broken as error:
+                self._is_open = self._is_open and error.retry_after_s > 0
+                pause = yield from self._wait(error, deadline, pause)
+
+    def _exchange(self, message: dict[str, Any], seq: int) -> Flow:
+        """Sends a frame; gives the answer to it. If the server knows the frame already, it answers again."""
+        try:
+            yield Send(msgpack.packb({**message, "seq": seq - self._first_seq}))
+        except Broken:
+            # Why the server closed the socket stands in its last message; then this raises.
+            while True:
+                yield from self._receive()
+        while True:
+            answer = yield from self._receive()
+            if answer["type"] in ("prediction", "buffering", "overtaken"):
+                return answer
+            if answer["type"] == "error":
+                if answer["code"] == "overloaded":
+                    raise Broken(answer["detail"], retry_after_s=1.0)
+                raise StreamError(answer["code"], answer["detail"])
+
+    def _receive(self) -> Flow:
+        answer: dict[str, Any] = msgpack.unpackb((yield Receive()))
+        if answer["type"] == "closing":
+            self._is_open = False
+            yield Shut()
+            if answer["reason"] in FINAL_REASONS:
+                self._is_closed = True
+                raise StreamClosed(answer["reason"])
+            raise Broken(f"the server closed the stream: {answer['reason']}")
+        return answer
+
+    def _connect(self) -> Flow:
+        if self._is_closed:
+            raise StreamClosed("closed")
+        yield Shut()
+        if self._id:
+            try:
+                ready = yield from self._open_socket()
+                # One more if the server had the frame whose answer got lost.
+                if ready["next_seq"] in (self.next_seq - self._first_seq, self.next_seq - self._first_seq + 1):
+                    self._is_open = True
+                    return
+                yield Shut()
+            except ApiError as error:
+                if error.status != 404:
+                    raise
+        yield from self._begin()
+
+    def _begin(self) -> Flow:
+        """Opens a new session, and sends the context again."""
+        try:
+            created = yield calls.create_session(self._model, self._resize)
+        except Unavailable as error:
+            raise Broken(error.detail, error.retry_after_s) from error
+        except ConnectionFailed as error:
+            raise Broken(str(error)) from error
+        self._id, self._token = created["id"], created["token"]
+        yield from self._open_socket()
+        self._first_seq = self.next_seq - len(self._context)
+        for index, message in enumerate(self._context):
+            # Only the last of a full context is predicted from, and nobody reads that.
+            yield from self._exchange(_one_step(message), self._first_seq + index)
+        self._replayed = bool(self._context)
+        self._is_open = True
+
+    def _open_socket(self) -> Flow:
+        try:
+            yield Open(f"/v1/sessions/{self._id}/stream?token={quote(self._token)}")
+        except Unavailable as error:
+            raise Broken(error.detail, error.retry_after_s) from error
+        ready: Mapping[str, Any] = yield from self._receive()
+        self.spec, self.version = Spec.of(ready["spec"]), ready["version"]
+        return ready
+
+    def _wait(self, error: Broken, deadline: float, pause: float) -> Flow:
+        seconds = max(pause, error.retry_after_s)
+        if time.monotonic() + seconds > deadline:
+            raise ConnectionFailed(f"the stream broke, and {self._reconnect_s:g} s of attempts were in vain: {error}")
+        yield Pause(seconds)
+        return min(2 * pause, LONGEST_PAUSE_S)
+
+    def _read(self, answer: Mapping[str, Any]) -> Answer:
+        assert self.spec is not None
+        prediction = None
+        if answer["type"] == "prediction":
+            known = {**answer, "model": self._model, "version": self.version}
+            prediction = Prediction.of(known, self.spec.size)
+        need = self.spec.context
+        return Answer(
+            seq=answer["seq"] + self._first_seq,
+            timestamp_us=answer["timestamp_us"],
+            prediction=prediction,
+            have=answer.get("have", need),
+            need=need,
+            replayed=self._replayed,
+        )
+
+
+def _one_step(message: dict[str, Any]) -> dict[str, Any]:
+    shortened = {**message, "steps": 1}
+    if "plan" in message:
+        shortened["plan"] = message["plan"][:1]
+    return shortened

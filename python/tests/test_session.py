@@ -1,0 +1,190 @@
+"""Sessions of a real server, whose connections break and which restarts."""
+
+import asyncio
+import socket
+import threading
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+import foreframe
+from conftest import MODELS, PROGRAM, Drive
+
+MODEL = "moving-flow"
+
+
+def answers(session: foreframe.Session, drive: Drive, numbers: range) -> list[foreframe.Answer]:
+    return [session.step(drive.frames[n], action=drive.actions[n], state=drive.states[n]) for n in numbers]
+
+
+def same(found: list[foreframe.Answer], expected: list[foreframe.Answer]) -> None:
+    assert [answer.seq for answer in found] == [answer.seq for answer in expected]
+    for one, other in zip(found, expected):
+        assert (one.prediction is None) == (other.prediction is None)
+        if one.prediction and other.prediction:
+            assert np.array_equal(one.prediction.frames, other.prediction.frames)
+
+
+@pytest.fixture(scope="module")
+def unbroken(client: foreframe.Client, drive: Drive) -> list[foreframe.Answer]:
+    with client.session(MODEL) as session:
+        return answers(session, drive, range(12))
+
+
+def test_the_context_fills_and_then_each_frame_is_answered(unbroken: list[foreframe.Answer], drive: Drive) -> None:
+    assert [answer.prediction is None for answer in unbroken] == [True] * 4 + [False] * 8
+    assert (unbroken[1].have, unbroken[1].need) == (2, 5)
+    last = unbroken[-1].prediction
+    assert last is not None and last.frames.shape == (5, 64, 64) and last.model == MODEL and last.expected_mse.shape == (5,)
+
+
+class Proxy:
+    """Passes bytes between a client and the server, until it cuts all connections."""
+
+    def __init__(self, url: str) -> None:
+        self._target = ("127.0.0.1", int(url.rsplit(":", 1)[1]))
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self._open: list[socket.socket] = []
+        self.url = f"http://127.0.0.1:{self._listener.getsockname()[1]}"
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    def _accept(self) -> None:
+        while True:
+            try:
+                near, _ = self._listener.accept()
+            except OSError:
+                return
+            far = socket.create_connection(self._target)
+            self._open += [near, far]
+            for source, sink in ((near, far), (far, near)):
+                threading.Thread(target=self._pass, args=(source, sink), daemon=True).start()
+
+    def _pass(self, source: socket.socket, sink: socket.socket) -> None:
+        try:
+            while data := source.recv(65536):
+                sink.sendall(data)
+        except OSError:
+            pass
+        self._end(sink)
+
+    def _end(self, connection: socket.socket) -> None:
+        try:
+            connection.shutdown(socket.SHUT_RDWR)
+        except OSError:
+            pass
+
+    def cut(self) -> None:
+        while self._open:
+            connection = self._open.pop()
+            self._end(connection)
+            connection.close()
+
+    def close(self) -> None:
+        self._listener.close()
+        self.cut()
+
+
+@pytest.fixture
+def proxy(server: foreframe.Server) -> Iterator[Proxy]:
+    proxy = Proxy(server.url)
+    yield proxy
+    proxy.close()
+
+
+def test_a_broken_connection_changes_no_prediction(proxy: Proxy, drive: Drive, unbroken: list[foreframe.Answer]) -> None:
+    with foreframe.Client(proxy.url) as client, client.session(MODEL) as session:
+        found = answers(session, drive, range(3))
+        proxy.cut()
+        found += answers(session, drive, range(3, 7))
+        proxy.cut()
+        found += answers(session, drive, range(7, 12))
+    same(found, unbroken)
+    assert not any(answer.replayed for answer in found), "the server kept the session"
+
+
+def test_a_lost_session_is_begun_again_with_the_last_frames(
+    client: foreframe.Client, drive: Drive, unbroken: list[foreframe.Answer]
+) -> None:
+    with client.session(MODEL) as session:
+        found = answers(session, drive, range(8))
+        client.run(foreframe.calls.delete_session(*session._flow.identity))
+        with pytest.raises(foreframe.StreamClosed, match="deleted"):
+            answers(session, drive, range(8, 9))
+    with client.session(MODEL) as session:
+        found = answers(session, drive, range(8))
+        forget(client, session)
+        found += answers(session, drive, range(8, 12))
+    same(found, unbroken)
+    assert [answer.replayed for answer in found] == [False] * 8 + [True] + [False] * 3
+
+
+def forget(client: foreframe.Client, session: foreframe.Session) -> None:
+    """The server loses the session while its socket is closed."""
+    assert session._socket is not None
+    session._socket.close()
+    client.run(foreframe.calls.delete_session(*session._flow.identity))
+
+
+def test_a_session_survives_a_restart_of_the_server(tmp_path, drive: Drive, unbroken: list[foreframe.Answer]) -> None:
+    free = socket.create_server(("127.0.0.1", 0))
+    port = free.getsockname()[1]
+    free.close()
+    options = {"program": PROGRAM, "models_dir": MODELS, "data_dir": tmp_path / "data", "port": port}
+    server = foreframe.serve(**options)
+    with server.client() as client, client.session(MODEL) as session:
+        found = answers(session, drive, range(8))
+        server.close()
+        restart = threading.Thread(target=lambda: restarted.append(foreframe.serve(**options)))
+        restarted: list[foreframe.Server] = []
+        restart.start()
+        found += answers(session, drive, range(8, 12))
+        restart.join()
+    restarted[0].close()
+    same(found, unbroken)
+    assert found[8].replayed
+
+
+def test_a_server_that_stays_away_is_an_error(drive: Drive) -> None:
+    server = foreframe.serve(program=PROGRAM, models_dir=MODELS)
+    with server.client() as client, client.session(MODEL, reconnect_s=0.5) as session:
+        answers(session, drive, range(1))
+        server.close()
+        with pytest.raises(foreframe.ConnectionFailed, match="in vain"):
+            answers(session, drive, range(1, 2))
+
+
+def test_a_refused_frame_changes_nothing(client: foreframe.Client, drive: Drive, unbroken: list[foreframe.Answer]) -> None:
+    with client.session(MODEL) as session:
+        found = answers(session, drive, range(6))
+        with pytest.raises(foreframe.StreamError, match="state is missing") as refused:
+            session.step(drive.frames[6], action=drive.actions[6])
+        assert refused.value.code == "invalid" and session.next_seq == 6
+        found += answers(session, drive, range(6, 12))
+    same(found, unbroken)
+    with pytest.raises(foreframe.ApiError, match="no model"):
+        client.session("nothing").step(drive.frames[0])
+
+
+def test_a_session_rolls_plans_out_also_after_it_was_lost(client: foreframe.Client, drive: Drive) -> None:
+    plans = [np.tile([0.3, turn], (5, 1)) for turn in (-0.5, 0.5)]
+    with client.session(MODEL) as session:
+        answers(session, drive, range(8))
+        before = session.rollouts(plans)
+        forget(client, session)
+        after = session.rollouts(plans)
+    assert before.frames.shape == (2, 5, 64, 64) and np.array_equal(before.frames, after.frames)
+
+
+def test_the_async_session_does_the_same(proxy: Proxy, drive: Drive, unbroken: list[foreframe.Answer]) -> None:
+    async def stream() -> list[foreframe.Answer]:
+        found = []
+        async with foreframe.AsyncClient(proxy.url) as client, client.session(MODEL) as session:
+            for n in range(12):
+                if n == 6:
+                    proxy.cut()
+                found.append(await session.step(drive.frames[n], action=drive.actions[n], state=drive.states[n]))
+            await session.rollouts([drive.actions[4:9]])
+        return found
+
+    same(asyncio.run(stream()), unbroken)
