@@ -9,12 +9,17 @@
 //! Sizes beside those of [`crate::nn`]: M items (N rollouts of K steps each, step after step), C channels on the grid of a
 //! quarter of the frame's sides.
 //!
-//! Reading order: `room_geometry` → `encoder_views` and `rollout_rows` (what the network reads) → `scene` and `motion` → `layers` (its tensors) → `network` → `direct` and
-//! `recurrent` (its two forms) → `predict` → `beyond_horizon`.
+//! The form with `depth` remembers nothing: it estimates how deep the last frame is, and `reprojection` says where the moved
+//! camera saw each of its pixels.
+//!
+//! Reading order: `room_geometry` → `encoder_views` and `rollout_rows` (what the network reads) → `scene` and `motion`, or
+//! `depth_views`, `reprojection` and `depth_head` → `layers` (its tensors) → `network` → `direct`, `recurrent` and `depth` (its
+//! three forms) → `predict` → `beyond_horizon`.
 
 mod beyond_horizon;
 mod blocks;
 mod depth;
+mod depth_head;
 mod depth_views;
 mod direct;
 mod encoder_views;

@@ -9,6 +9,7 @@ use super::scene::Scene;
 use crate::nn::error::NnError;
 use crate::nn::geometry::camera::{CameraPose, Viewer, turning_places};
 use crate::nn::ops::compose::{Composition, RoomPlaces, SCENE_FEATURES};
+use crate::nn::ops::linear::per_place;
 use crate::nn::ops::pixel_shuffle::pixel_unshuffle;
 use crate::nn::ops::sampling::{own_places, sample_features};
 use crate::nn::tensors::with_values;
@@ -50,7 +51,7 @@ impl FlowNetwork {
         let modulation = self.modulate(rows, &motion)?;
         let features = scene.narrow(3, 0, SCENE_FEATURES)?;
         let mixed = Tensor::cat(&[&warped, &pixel_unshuffle(&features)?], 3)?;
-        let state = self.refined(Self::per_place(&self.mix, &mixed)?, &modulation)?;
+        let state = self.refined(per_place(&self.mix, &mixed)?, &modulation)?;
         let head = self.head(&state, &moved, &scene)?;
 
         let composition = Composition {

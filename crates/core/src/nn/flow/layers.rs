@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use super::blocks::MOVED_CHANNELS;
-use super::depth::{FINE_VALUES, MIXED_VALUES};
+use super::depth_head::{FINE_VALUES, MIXED_VALUES};
 use super::depth_views::DepthViews;
 use super::encoder_views::EncoderViews;
 use super::motion::{MOTION_HIDDEN, WHEELS};

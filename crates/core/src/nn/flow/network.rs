@@ -3,7 +3,7 @@
 use candle_core::{Device, Tensor};
 use candle_nn::Module as _;
 
-use super::depth::DepthHead;
+use super::depth_head::DepthHead;
 use super::layers::mix_name;
 use super::motion::MotionHead;
 use super::rollout_rows::RolloutRows;
@@ -11,7 +11,7 @@ use super::scene::Scene;
 use crate::nn::error::NnError;
 use crate::nn::model_tensors::ModelTensors;
 use crate::nn::ops::convolution::{ConvShape, Convolution3};
-use crate::nn::ops::linear::Linear;
+use crate::nn::ops::linear::{Linear, per_place};
 use crate::nn::ops::modulation::{modulated_silu, perceptron, silu};
 use crate::nn::ops::pixel_shuffle::pixel_shuffle;
 use crate::nn::spec::{FlowSpec, ModelSpec};
@@ -108,7 +108,7 @@ impl FlowNetwork {
 
     /// The head's values of each item `[M, H/2, W/2, 4 · HEAD_VALUES]` from its state, the pixels to move and the scene.
     pub(super) fn head(&self, state: &Tensor, moved: &Tensor, scene: &Tensor) -> Result<Tensor, NnError> {
-        let enlarged = pixel_shuffle(&Self::per_place(&self.enlarge, &silu(state)?)?)?;
+        let enlarged = pixel_shuffle(&per_place(&self.enlarge, &silu(state)?)?)?;
         let inputs = Tensor::cat(&[&enlarged, moved, scene], 3)?;
         Ok(self.head.forward(&silu(&self.fine.forward(&inputs)?)?)?)
     }
@@ -134,11 +134,5 @@ impl FlowNetwork {
             inputs = Tensor::cat(&[&inputs, &motion.flatten(0, 1)?], 1)?;
         }
         Ok(perceptron(&self.modulation, &inputs)?)
-    }
-
-    /// A linear layer at each place of `[M, h, w, …]`.
-    pub(super) fn per_place(layer: &Linear, x: &Tensor) -> Result<Tensor, NnError> {
-        let (items, height, width, _) = x.dims4()?;
-        Ok(layer.forward(&x.flatten(0, 2)?)?.reshape((items, height, width, ()))?)
     }
 }

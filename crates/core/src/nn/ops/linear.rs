@@ -27,6 +27,12 @@ impl Module for Linear {
     }
 }
 
+/// The layer at each place of a grid `[M, h, w, D]`.
+pub(in crate::nn) fn per_place(layer: &Linear, x: &Tensor) -> Result<Tensor> {
+    let (items, height, width, _) = x.dims4()?;
+    layer.forward(&x.flatten(0, 2)?)?.reshape((items, height, width, ()))
+}
+
 /// Sum, bias and activation in one pass. It computes the input's gradient only if it is needed.
 struct FusedLinear {
     has_tanh: bool,
