@@ -4,6 +4,7 @@ pub(super) mod audit;
 pub(super) mod datasets;
 pub(super) mod environments;
 pub(super) mod health;
+pub(super) mod inference_protocol;
 pub(super) mod job_events;
 pub(super) mod jobs;
 pub(super) mod metrics;
