@@ -108,15 +108,16 @@ answer = client.infer(MODEL, [tensor("frames", frames), tensor("state", state), 
 assert "action linear is 9 m/s" in answer.get_response()["parameters"]["warnings"]
 passed("warnings")
 
-context = [tensor("frames", frames), tensor("state", state)]
-refused("state is missing", inputs=[tensor("frames", frames)])
+rest = [tensor("state", state), tensor("plan", plan)]
+context = [tensor("frames", frames), *rest]
+refused("state is missing", inputs=[tensor("frames", frames), rest[1]])
 refused("no model", model="nothing", inputs=context)
 refused("is not active", model_version="7", inputs=context)
-refused("takes 5", inputs=[tensor("frames", frames[:4]), tensor("state", state)])
-refused("has the shape [5, 32, 64]", inputs=[tensor("frames", frames[:, :32].copy()), tensor("state", state)])
+refused("takes 5", inputs=[tensor("frames", frames[:4]), *rest])
+refused("has the shape [5, 32, 64]", inputs=[tensor("frames", frames[:, :32].copy()), *rest])
 refused("input \"colour\" is unknown", inputs=[*context, tensor("colour", state)])
 refused("output \"depth\" is unknown", inputs=context, outputs=[triton.InferRequestedOutput("depth")])
-refused("intensity from 0 to 1", inputs=[tensor("frames", frames.astype(np.float32)), tensor("state", state)])
+refused("intensity from 0 to 1", inputs=[tensor("frames", frames.astype(np.float32)), *rest])
 refused("sequences are not supported", inputs=context, sequence_id=1, sequence_start=True)
 refused("Content-Encoding", inputs=context, request_compression_algorithm="gzip")
 passed("errors in the server's words")

@@ -20,7 +20,7 @@ use foreframe_core::registry::{Manifest, Model};
 use foreframe_core::serving::{Prediction, PredictionInput, Rollout, Task};
 
 /// What is to be computed.
-struct Inference {
+struct InferenceTask {
     task: Task,
     /// Whether frames are intensities from 0 to 1, in both directions.
     is_float: bool,
@@ -53,8 +53,8 @@ async fn answer(app: &App, model: &Arc<Model>, request: InferRequest) -> Result<
     request.answer.check(&names, &manifest)?;
     let InferRequest { inputs, steps, answer } = request;
     let known = Arc::clone(&manifest);
-    let read = move || Inference::read(inputs, steps, &known, &config);
-    let Inference {
+    let read = move || InferenceTask::read(inputs, steps, &known, &config);
+    let InferenceTask {
         task,
         is_float,
         has_plans,
@@ -72,7 +72,7 @@ async fn answer(app: &App, model: &Arc<Model>, request: InferRequest) -> Result<
     Ok((app.predictions.run(write).await?, times))
 }
 
-impl Inference {
+impl InferenceTask {
     fn read(
         mut inputs: BTreeMap<String, Tensor>,
         steps: Option<usize>,
