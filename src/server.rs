@@ -3,7 +3,7 @@
 //!
 //! The rooms in the order in which they may use each other; each uses only those before it:
 //! `config`, `msgpack`, `http` (connections, limits, keys, problem details), `blocking`, `render_cache`, `images`, `stream` (a session and its
-//! WebSocket), `environments`, `state` ([`App`]), `routes` (one resource a file), `openapi`, `router`, `admin` (health checks and metrics on their own
+//! WebSocket), `environments`, `inference_statistics`, `state` ([`App`]), `routes` (one resource a file), `openapi`, `router`, `admin` (health checks and metrics on their own
 //! address), `serve`.
 
 mod admin;
@@ -12,6 +12,7 @@ mod config;
 mod environments;
 mod http;
 mod images;
+mod inference_statistics;
 mod msgpack;
 mod openapi;
 mod render_cache;

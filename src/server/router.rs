@@ -17,8 +17,8 @@ use super::http::problem::ApiError;
 use super::http::requests;
 use super::openapi;
 use super::routes::{
-    audit, datasets, environments, episodes, events, health, job_events, jobs, metrics, models, pages, predict,
-    preview, rollouts, sessions, streams,
+    audit, datasets, environments, episodes, events, health, inference_protocol, job_events, jobs, metrics, models,
+    pages, predict, preview, rollouts, sessions, streams,
 };
 use super::state::App;
 
@@ -29,12 +29,17 @@ pub fn router(app: App) -> Router {
         .route_layer(from_fn_with_state(app.requests.clone(), requests::answer))
         .merge(stream_routes())
         .route_layer(from_fn_with_state(app.keys.clone(), keys::check));
+    let inference = inference_protocol::routes()
+        .route_layer(from_fn_with_state(app.requests.clone(), requests::answer))
+        .route_layer(from_fn_with_state(app.keys.clone(), keys::check));
     let (router, contract) = open_routes().merge(api).split_for_parts();
     let document = openapi::text(contract);
     let trace = RequestTrace::new(config, Arc::clone(&app.draining));
     let origins = OriginPolicy::new(config, app.keys.clone());
     router
         .merge(pages::docs())
+        .merge(inference)
+        .merge(inference_protocol::open_routes())
         .layer(Extension(pages::ContractText(document.into())))
         .method_not_allowed_fallback(async || ApiError::MethodNotAllowed)
         .fallback(async || ApiError::NotFound("there is nothing at this path; see /openapi.json".to_owned()))

@@ -6,6 +6,7 @@ pub(super) mod environments;
 pub(super) mod episodes;
 pub(super) mod events;
 pub(super) mod health;
+pub(super) mod inference_protocol;
 pub(super) mod job_events;
 pub(super) mod jobs;
 pub(super) mod metrics;

@@ -22,6 +22,7 @@ use super::http::body_budget::BodyBudget;
 use super::http::keys::{Caller, Keys};
 use super::http::task_limit::{TaskLimit, stop_requested};
 use super::http::tls::ServerTls;
+use super::inference_statistics::InferenceStatistics;
 use super::render_cache::RenderCache;
 use super::stream::session_table::SessionTable;
 use foreframe_core::registry::Model;
@@ -76,6 +77,7 @@ pub struct AppState {
     /// Whether the server is stopping: it still answers, but reports that it is not ready.
     pub(super) draining: Arc<AtomicBool>,
     pub(super) sessions: SessionTable,
+    pub(super) inference_statistics: InferenceStatistics,
 }
 
 impl Deref for App {
@@ -133,6 +135,7 @@ impl App {
                 environments: Environments::new(&config),
                 draining: Arc::default(),
                 sessions: SessionTable::new(config.max_sessions, Duration::from_millis(config.session_grace_ms)),
+                inference_statistics: InferenceStatistics::default(),
                 config: Arc::new(config),
                 parts,
             }),

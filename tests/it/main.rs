@@ -32,6 +32,7 @@ mod import_memory;
 mod import_names;
 mod import_programs;
 mod import_videos;
+mod inference_protocol;
 mod inspection;
 mod jobs;
 mod jobs_checkpoints;

@@ -12,6 +12,10 @@ pub(super) fn route(request: &Request) -> &str {
 
 /// The scope that a request needs, by its method and its route's template. A route without a rule needs `admin`.
 pub(in crate::server) fn required_scope(method: &Method, route: &str) -> KeyScope {
+    // The Open Inference Protocol only predicts.
+    if route.starts_with("/v2/") {
+        return KeyScope::Predict;
+    }
     let mut parts = route.split('/').skip(2);
     let (resource, changes_versions) = (parts.next().unwrap_or_default(), route.contains("/versions/"));
     match resource {
@@ -55,6 +59,11 @@ mod tests {
             (Method::POST, "/v1/jobs", KeyScope::Jobs),
             (Method::GET, "/v1/audit", KeyScope::Admin),
             (Method::GET, "/v1/new", KeyScope::Admin),
+            (
+                Method::POST,
+                "/v2/models/{model}/versions/{version}/infer",
+                KeyScope::Predict,
+            ),
         ] {
             assert_eq!(required_scope(&method, route), scope, "{method} {route}");
         }

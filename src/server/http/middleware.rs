@@ -12,7 +12,7 @@ use metrics::{counter, histogram};
 use tracing::{Instrument, debug, info_span};
 
 use super::access::route;
-use super::problem::{self, ApiError};
+use super::problem::{self, ApiError, ErrorForm};
 use crate::server::config::ServerConfig;
 use foreframe_core::metric_names;
 
@@ -61,7 +61,7 @@ pub(in crate::server) async fn trace(State(trace): State<RequestTrace>, request:
     // Labels with few values, whatever clients send.
     let (method, route) = (method(request.method()), route(&request));
     let route = if route.is_empty() { "none" } else { route }.to_owned();
-    let limit = trace.limit;
+    let (limit, form) = (trace.limit, ErrorForm::of(request.uri().path()));
     let work = async move {
         let started = Instant::now();
         let answered = async {
@@ -87,7 +87,7 @@ pub(in crate::server) async fn trace(State(trace): State<RequestTrace>, request:
         histogram!(metric_names::HTTP_REQUEST_SECONDS, "route" => route).record(elapsed);
         response
     };
-    let mut response = problem::finish(work.instrument(span).await, &id);
+    let mut response = problem::finish(work.instrument(span).await, form, &id);
     let headers = response.headers_mut();
     headers.insert(header::X_CONTENT_TYPE_OPTIONS, HeaderValue::from_static("nosniff"));
     if let Ok(id) = HeaderValue::from_str(&id) {

@@ -174,16 +174,42 @@ pub(in crate::server) fn unfit<E: Display>(field: &str) -> impl Fn(E) -> ApiErro
     move |error| ApiError::Unprocessable(format!("{field}: {error}"))
 }
 
+/// How the body of an error is written.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(in crate::server) enum ErrorForm {
+    /// Problem details.
+    Problem,
+    /// `{"error": …}`, as the Open Inference Protocol has it.
+    Inference,
+}
+
+impl ErrorForm {
+    /// The form of errors at a path.
+    pub(in crate::server) fn of(path: &str) -> Self {
+        let is_inference = path
+            .strip_prefix("/v2")
+            .is_some_and(|rest| rest.is_empty() || rest.starts_with('/'));
+        if is_inference { Self::Inference } else { Self::Problem }
+    }
+}
+
 /// Writes the body of an error response.
-pub(in crate::server) fn finish(mut response: Response, request_id: &str) -> Response {
+pub(in crate::server) fn finish(mut response: Response, form: ErrorForm, request_id: &str) -> Response {
     let Some(mut problem) = response.extensions_mut().remove::<Problem>() else {
         return response;
     };
     request_id.clone_into(&mut problem.instance);
-    *response.body_mut() = Body::from(problem.json());
+    let (body, media_type) = match form {
+        ErrorForm::Problem => (problem.json(), MEDIA_TYPE),
+        ErrorForm::Inference => {
+            let body = serde_json::json!({"error": problem.detail}).to_string().into_bytes();
+            (body, "application/json")
+        }
+    };
+    *response.body_mut() = Body::from(body);
     let headers = response.headers_mut();
     headers.remove(header::CONTENT_LENGTH);
-    headers.insert(header::CONTENT_TYPE, HeaderValue::from_static(MEDIA_TYPE));
+    headers.insert(header::CONTENT_TYPE, HeaderValue::from_static(media_type));
     response
 }
 

@@ -193,7 +193,7 @@ impl RolloutRequest {
 }
 
 /// The conditioning input of each plan.
-fn conditioning(
+pub(super) fn conditioning(
     plans: Vec<Vec<Vec<f32>>>,
     steps: Option<usize>,
     state: Option<RobotState>,

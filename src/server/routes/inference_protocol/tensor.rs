@@ -1,0 +1,246 @@
+//! Tensors: their types, and their values as JSON and as bytes.
+
+use std::fmt;
+
+use serde::de::{DeserializeSeed, SeqAccess, Visitor};
+use serde::{Deserialize, Deserializer};
+use serde_json::{Value, json};
+
+use crate::server::http::problem::ApiError;
+
+/// The types of values that this server takes and gives.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Datatype {
+    Uint8,
+    Fp32,
+}
+
+impl Datatype {
+    pub(super) fn name(self) -> &'static str {
+        match self {
+            Self::Uint8 => "UINT8",
+            Self::Fp32 => "FP32",
+        }
+    }
+
+    fn bytes(self) -> usize {
+        match self {
+            Self::Uint8 => 1,
+            Self::Fp32 => 4,
+        }
+    }
+}
+
+/// An input or output of a model.
+pub(super) struct Field {
+    pub(super) name: &'static str,
+    pub(super) datatype: Datatype,
+    pub(super) shape: Vec<i64>,
+    pub(super) is_optional: bool,
+}
+
+impl Field {
+    pub(super) fn new(name: &'static str, datatype: Datatype, shape: Vec<i64>) -> Self {
+        Self {
+            name,
+            datatype,
+            shape,
+            is_optional: false,
+        }
+    }
+
+    pub(super) fn optional(self) -> Self {
+        Self {
+            is_optional: true,
+            ..self
+        }
+    }
+}
+
+/// Values in row-major order.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) enum Values {
+    Uint8(Vec<u8>),
+    Fp32(Vec<f32>),
+}
+
+/// A tensor.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct Tensor {
+    pub(super) name: String,
+    pub(super) shape: Vec<usize>,
+    pub(super) values: Values,
+}
+
+/// The head of an input in a request.
+#[derive(Debug, Deserialize)]
+pub(super) struct InputHead {
+    pub(super) name: String,
+    shape: Vec<usize>,
+    datatype: String,
+    #[serde(default)]
+    parameters: InputParameters,
+    data: Option<Numbers>,
+}
+
+#[derive(Debug, Default, Deserialize)]
+struct InputParameters {
+    binary_data_size: Option<usize>,
+    shared_memory_region: Option<String>,
+}
+
+impl Tensor {
+    /// The tensor of an input, and the bytes after it. Errors: `Unprocessable`, with the input's name.
+    pub(super) fn read(head: InputHead, binary: &[u8]) -> Result<(Self, &[u8]), ApiError> {
+        let name = head.name.escape_default().to_string();
+        let refused = |reason: String| ApiError::Unprocessable(format!("input \"{name}\" {reason}"));
+        let datatype = match head.datatype.as_str() {
+            "UINT8" => Datatype::Uint8,
+            "FP32" => Datatype::Fp32,
+            other => {
+                return Err(refused(format!(
+                    "is {}; this server takes UINT8 and FP32",
+                    other.escape_default()
+                )));
+            }
+        };
+        if head.parameters.shared_memory_region.is_some() {
+            return Err(refused("is in shared memory; send its data".to_owned()));
+        }
+        let count = head
+            .shape
+            .iter()
+            .try_fold(1_usize, |count, side| count.checked_mul(*side));
+        let Some(count) = count else {
+            return Err(refused(format!("has the shape {:?}, which is too large", head.shape)));
+        };
+        let wrong = |found: usize| refused(format!("holds {found} values; its shape {:?} has {count}", head.shape));
+        let (values, rest) = match (head.data, head.parameters.binary_data_size) {
+            (Some(Numbers(numbers)), None) => {
+                if numbers.len() != count {
+                    return Err(wrong(numbers.len()));
+                }
+                (from_numbers(datatype, numbers).map_err(refused)?, binary)
+            }
+            (None, Some(size)) => {
+                if size > binary.len() {
+                    return Err(refused(format!("has {size} bytes; {} follow the header", binary.len())));
+                }
+                let (bytes, rest) = binary.split_at(size);
+                if Some(size) != count.checked_mul(datatype.bytes()) {
+                    return Err(wrong(size / datatype.bytes()));
+                }
+                (from_bytes(datatype, bytes), rest)
+            }
+            _ => return Err(refused("needs either data or binary_data_size".to_owned())),
+        };
+        let tensor = Self {
+            name: head.name,
+            shape: head.shape,
+            values,
+        };
+        Ok((tensor, rest))
+    }
+
+    /// The tensor as an output; `is_binary`: without its values, which [`Tensor::into_bytes`] gives.
+    pub(super) fn described(&self, is_binary: bool) -> Value {
+        let datatype = match self.values {
+            Values::Uint8(_) => Datatype::Uint8,
+            Values::Fp32(_) => Datatype::Fp32,
+        };
+        let mut described = json!({"name": self.name, "datatype": datatype.name(), "shape": self.shape});
+        if is_binary {
+            let count: usize = self.shape.iter().product();
+            described["parameters"] = json!({"binary_data_size": count * datatype.bytes()});
+        } else {
+            described["data"] = match &self.values {
+                Values::Uint8(values) => json!(values),
+                Values::Fp32(values) => json!(values),
+            };
+        }
+        described
+    }
+
+    /// The values, little-endian.
+    pub(super) fn into_bytes(self) -> Vec<u8> {
+        match self.values {
+            Values::Uint8(values) => values,
+            Values::Fp32(values) => values.into_iter().flat_map(f32::to_le_bytes).collect(),
+        }
+    }
+}
+
+fn from_numbers(datatype: Datatype, numbers: Vec<f32>) -> Result<Values, String> {
+    if datatype == Datatype::Fp32 {
+        return Ok(Values::Fp32(numbers));
+    }
+    let byte = |value: f32| {
+        let is_byte = (0.0..=255.0).contains(&value) && value.fract() == 0.0;
+        is_byte.then_some(value as u8).ok_or(value)
+    };
+    let bytes: Result<Vec<u8>, f32> = numbers.into_iter().map(byte).collect();
+    bytes
+        .map(Values::Uint8)
+        .map_err(|value| format!("holds {value}; UINT8 is a whole number from 0 to 255"))
+}
+
+fn from_bytes(datatype: Datatype, bytes: &[u8]) -> Values {
+    match datatype {
+        Datatype::Uint8 => Values::Uint8(bytes.to_vec()),
+        Datatype::Fp32 => {
+            let (words, _) = bytes.as_chunks::<4>();
+            Values::Fp32(words.iter().map(|word| f32::from_le_bytes(*word)).collect())
+        }
+    }
+}
+
+/// The numbers of a list that may be nested, in order.
+#[derive(Debug)]
+struct Numbers(Vec<f32>);
+
+impl<'de> Deserialize<'de> for Numbers {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        let mut numbers = Vec::new();
+        Element(&mut numbers).deserialize(deserializer)?;
+        Ok(Self(numbers))
+    }
+}
+
+/// A number, or a list of elements.
+struct Element<'a>(&'a mut Vec<f32>);
+
+impl<'de> DeserializeSeed<'de> for Element<'_> {
+    type Value = ();
+
+    fn deserialize<D: Deserializer<'de>>(self, deserializer: D) -> Result<(), D::Error> {
+        deserializer.deserialize_any(self)
+    }
+}
+
+impl<'de> Visitor<'de> for Element<'_> {
+    type Value = ();
+
+    fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("numbers in lists")
+    }
+
+    fn visit_f64<E>(self, value: f64) -> Result<(), E> {
+        self.0.push(value as f32);
+        Ok(())
+    }
+
+    fn visit_i64<E>(self, value: i64) -> Result<(), E> {
+        self.0.push(value as f32);
+        Ok(())
+    }
+
+    fn visit_u64<E>(self, value: u64) -> Result<(), E> {
+        self.0.push(value as f32);
+        Ok(())
+    }
+
+    fn visit_seq<A: SeqAccess<'de>>(self, mut items: A) -> Result<(), A::Error> {
+        while items.next_element_seed(Element(&mut *self.0))?.is_some() {}
+        Ok(())
+    }
+}
