@@ -100,10 +100,12 @@ impl InferenceTask {
             )));
         }
         let has_plans = plans.is_some();
-        let state = predict::last_state(state, None, frames.len())?;
+        let (past_states, state) = predict::states(state, None, frames.len())?;
         let task = if let Some(plans) = plans {
             Task::rollout(
                 frames,
+                past_states,
+                None,
                 rollouts::conditioning(plans, steps, state, manifest, config)?,
                 manifest,
             )?
@@ -115,6 +117,7 @@ impl InferenceTask {
                 state,
                 plan: plan.map(|plan| predict::actions("plan", plan)).transpose()?,
                 steps,
+                ..PredictionInput::default()
             };
             input.into_task(manifest)?
         };
