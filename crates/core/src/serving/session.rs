@@ -145,9 +145,10 @@ impl SessionState {
                 frames,
             });
         }
-        let past_states = match spec.reads_past_states() {
-            true => check_states(snapshot.past_states, manifest)?,
-            false => Vec::new(),
+        let past_states = if spec.reads_past_states() {
+            check_states(snapshot.past_states, manifest)?
+        } else {
+            Vec::new()
         };
         Ok(Self {
             past_states: past_states.into(),

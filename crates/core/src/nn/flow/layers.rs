@@ -56,6 +56,24 @@ pub(in crate::nn) fn multiply_adds_per_frame(spec: &ModelSpec, flow: &FlowSpec) 
     all.div_ceil(spec.horizon.max(1) as u64)
 }
 
+/// Channels that the encoder reads.
+fn channels_read(sizes: &FlowLayers) -> usize {
+    if sizes.depth {
+        DepthViews::channels(sizes.frames_read)
+    } else {
+        EncoderViews::channels(sizes.frames_read)
+    }
+}
+
+/// Channels beside the moved features from which a step's state is made.
+fn mixed_beside(sizes: &FlowLayers) -> usize {
+    match (sizes.depth, sizes.recurrent) {
+        (true, _) => MIXED_VALUES,
+        (false, true) => 4 * SCENE_FEATURES + FRAME_CHANNELS,
+        (false, false) => 4 * SCENE_FEATURES,
+    }
+}
+
 /// The layer that makes a step's state. In the recurrent form it adds to the state, so it starts small and has another
 /// name.
 pub(super) fn mix_name(sizes: &FlowLayers) -> &'static str {
@@ -77,11 +95,7 @@ fn layer_sizes(spec: &ModelSpec, flow: &FlowSpec) -> Vec<LayerSize> {
             rows,
         });
     };
-    let read = match sizes.depth {
-        true => DepthViews::channels(sizes.frames_read),
-        false => EncoderViews::channels(sizes.frames_read),
-    };
-    layer("stem", TAPS * read, sizes.stem_channels, half);
+    layer("stem", TAPS * channels_read(sizes), sizes.stem_channels, half);
     layer("halving", TAPS * sizes.stem_channels, channels, quarter);
     for index in 0..sizes.encoder_blocks {
         for part in ["first", "second"] {
@@ -123,13 +137,7 @@ fn layer_sizes(spec: &ModelSpec, flow: &FlowSpec) -> Vec<LayerSize> {
             half,
         );
     }
-    let mixed = channels
-        + match (sizes.depth, sizes.recurrent) {
-            (true, _) => MIXED_VALUES,
-            (false, true) => 4 * SCENE_FEATURES + FRAME_CHANNELS,
-            (false, false) => 4 * SCENE_FEATURES,
-        };
-    layer(mix_name(sizes), mixed, channels, horizon * quarter);
+    layer(mix_name(sizes), channels + mixed_beside(sizes), channels, horizon * quarter);
     for index in 0..sizes.decoder_blocks {
         for part in ["first", "second"] {
             let name = format!("decoder.{index}.{part}");

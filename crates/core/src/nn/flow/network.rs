@@ -72,9 +72,10 @@ impl FlowNetwork {
             blocks: (0..layers.encoder_blocks)
                 .map(|index| block(format!("encoder.{index}"), ConvShape::dilated(1 << (index % 3))))
                 .collect(),
-            surroundings: match layers.depth {
-                true => Surroundings::Seen(DepthHead::new(tensors)),
-                false => Surroundings::Remembered(Scene::new(&spec, sizes.camera, tensors)),
+            surroundings: if layers.depth {
+                Surroundings::Seen(DepthHead::new(tensors))
+            } else {
+                Surroundings::Remembered(Scene::new(&spec, sizes.camera, tensors))
             },
             motion: MotionHead::new(&spec, &sizes, tensors),
             modulation: ["inputs", "output"].map(|part| tensors.linear(&format!("flow.modulation.{part}"))),

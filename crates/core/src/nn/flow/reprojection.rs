@@ -238,7 +238,7 @@ mod tests {
         assert_gradients(&[wall(2.0)], 1e-2, |inputs| {
             reproject(reprojection(), &inputs[0], &motions)?.narrow(2, 0, 4)
         });
-        assert_gradients(&[motions.clone()], 1e-2, |inputs| {
+        assert_gradients(std::slice::from_ref(&motions), 1e-2, |inputs| {
             reproject(reprojection(), &wall(2.0), &inputs[0])?.narrow(2, 0, 4)
         });
     }

@@ -248,9 +248,10 @@ mod tests {
             size,
             frames: values(2 * 24, 1),
             frame_of: vec![0, 1, 1],
-            room: match with_room {
-                true => RoomPlaces::Known(values(3 * 48, 2).iter().map(|place| 2.5 * place + 2.13).collect()),
-                false => RoomPlaces::Turned,
+            room: if with_room {
+                RoomPlaces::Known(values(3 * 48, 2).iter().map(|place| 2.5 * place + 2.13).collect())
+            } else {
+                RoomPlaces::Turned
             },
         }
     }
