@@ -424,7 +424,7 @@ fn options_describe_the_camera_of_a_video() {
     let dataset = Dataset::open(&out).unwrap();
     assert_eq!(
         (dataset.info().frame_count, dataset.camera(0).unwrap().height_m),
-        (20, Some(0.3))
+        (10, Some(0.3))
     );
 }
 
