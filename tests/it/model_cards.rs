@@ -5,10 +5,12 @@ use std::path::Path;
 
 use serde_json::Value;
 
-const SETS: [(&str, &str); 4] = [
+const SETS: [(&str, &str); 6] = [
     ("test", "unseen trials"),
     ("unseen-pairs", "unseen pairs"),
     ("unseen-gains", "unseen gains"),
+    ("new-materials", "new materials"),
+    ("new-cameras", "new cameras"),
     ("validation", "validation"),
 ];
 

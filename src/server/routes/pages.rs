@@ -71,7 +71,7 @@ pub(in crate::server) fn routes() -> OpenApiRouter<App> {
         .routes(routes!(openapi_json))
         .routes(routes!(asyncapi_yaml));
     PAGE_FILES.into_iter().fold(pages, |pages, (path, text)| {
-        let media_type = if path.ends_with(".css") {
+        let media_type = if path.split('.').next_back() == Some("css") {
             "text/css"
         } else {
             "text/javascript"

@@ -120,7 +120,9 @@ impl CreateSession {
                 resize,
             };
             let mut state = SessionState::default();
-            camera.into_iter().for_each(|camera| state.set_camera(camera));
+            if let Some(camera) = camera {
+                state.set_camera(camera);
+            }
             return Ok((app.predictor().active(&name)?, state, settings));
         };
         if let Some(name) = self.model.filter(|name| *name != exported.model) {
@@ -145,7 +147,9 @@ impl CreateSession {
         };
         let mut state = SessionState::restore(exported.snapshot, manifest)
             .map_err(|error| ApiError::Unprocessable(format!("state.{error}")))?;
-        camera.into_iter().for_each(|camera| state.set_camera(camera));
+        if let Some(camera) = camera {
+            state.set_camera(camera);
+        }
         Ok((model, state, settings))
     }
 }

@@ -137,7 +137,12 @@ fn layer_sizes(spec: &ModelSpec, flow: &FlowSpec) -> Vec<LayerSize> {
             half,
         );
     }
-    layer(mix_name(sizes), channels + mixed_beside(sizes), channels, horizon * quarter);
+    layer(
+        mix_name(sizes),
+        channels + mixed_beside(sizes),
+        channels,
+        horizon * quarter,
+    );
     for index in 0..sizes.decoder_blocks {
         for part in ["first", "second"] {
             let name = format!("decoder.{index}.{part}");

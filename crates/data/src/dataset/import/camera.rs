@@ -13,6 +13,7 @@ use foreframe_core::frame::warp::CameraModel;
 const SQUARE_TOLERANCE: f64 = 0.02;
 
 /// How recorded images are projected, in pixels.
+#[expect(clippy::struct_field_names, reason = "the unit")]
 #[derive(Clone, Copy, Debug)]
 pub(super) struct RecordedProjection {
     pub(super) width_px: u32,
