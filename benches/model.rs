@@ -68,6 +68,7 @@ fn prediction(c: &mut Criterion) {
             let conditioning = ConditioningTensors {
                 actions: Some(zeros(&[windows, spec.horizon, spec.actions.len()])),
                 state: Some(zeros(&[windows, spec.states.len()])),
+                ..ConditioningTensors::none()
             };
             c.bench_function(&format!("{name} prediction of {windows} windows"), |b| {
                 b.iter(|| model.predict_frames(&frames, &conditioning).unwrap());

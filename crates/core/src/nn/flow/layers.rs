@@ -112,12 +112,8 @@ fn layer_sizes(spec: &ModelSpec, flow: &FlowSpec) -> Vec<LayerSize> {
         }
     }
     let moving = if actions.is_some() { 3 } else { 0 };
-    layer(
-        "modulation.inputs",
-        known + horizon + moving,
-        MODULATION_HIDDEN,
-        horizon,
-    );
+    let told = known + horizon + moving;
+    layer("modulation.inputs", told, MODULATION_HIDDEN, horizon);
     let modulated = (2 * sizes.decoder_blocks).max(1) * 2 * channels;
     layer("modulation.output", MODULATION_HIDDEN, modulated, horizon);
     let scene = SceneKind::of(spec, flow.camera).inputs(spec).filter(|_| !sizes.depth);
