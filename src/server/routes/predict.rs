@@ -102,7 +102,7 @@ impl WithFrames for PredictRequest {
     }
 }
 
-/// Predicts the frames that follow a context. The body is JSON, MessagePack with the same fields and binary images, or a form
+/// Predicts the frames that follow a context. The body is JSON, `MessagePack` with the same fields and binary images, or a form
 /// (`multipart/form-data`) with image files `frames` and the other fields as JSON in a part `request`.
 /// `Accept: application/msgpack` gives binary images, `Accept: image/png` gives a labelled contact sheet of the
 /// context and the prediction, `image/gif` an animation.
