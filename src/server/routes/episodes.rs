@@ -37,7 +37,8 @@ const INSPECTION_POLICY: &str = "default-src 'none'; img-src data:; style-src 'u
 struct FrameQuery {
     /// The first frame, counted from 0.
     #[serde(default)]
-    from: usize,
+    #[param(maximum = 4_294_967_295_u32)]
+    from: u32,
     /// The maximum number of frames, 1 to 300. Default: 300.
     #[param(minimum = 1, maximum = 300)]
     limit: Option<usize>,
@@ -83,7 +84,7 @@ async fn episode(
     let name = dataset_name(&app, &name).await?;
     let objects = app.store().objects();
     let info = datasets::describe(objects, &name).await.map_err(absent)?;
-    let FrameQuery { from, .. } = query;
+    let from = query.from as usize;
     let key = format!("dataset/{name}/{}/{episode}.{from}+{limit}", info.content_hash);
     let dir = datasets::fetch(objects, &name).await.map_err(absent)?;
     let read = move || {
