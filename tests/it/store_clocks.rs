@@ -9,7 +9,7 @@ use crate::store_away::{OwnPostgres, status};
 
 /// Where this machine's wall clock is read, and what for. Whatever is decided by a time has to go by `Store::now_s` or by a
 /// monotonic clock.
-const WALL_CLOCK: [(&str, &str); 10] = [
+const WALL_CLOCK: [(&str, &str); 11] = [
     (
         "src/files.rs",
         "the age of partial files, against times of the same file system",
@@ -17,6 +17,7 @@ const WALL_CLOCK: [(&str, &str); 10] = [
     ("src/jobs.rs", "imports it for the report"),
     ("src/jobs/report.rs", "the time of log lines, the rate that is shown"),
     ("src/server/http/middleware.rs", "ids of requests"),
+    ("src/server/inference_statistics.rs", "the time that is shown"),
     ("src/store.rs", "defines it"),
     ("src/store/audit.rs", "the time that is shown"),
     ("src/store/backup.rs", "the time that is shown; whether a file changed"),
