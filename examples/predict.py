@@ -479,6 +479,7 @@ class DepthNetwork(FlowNetwork):
 
     def motion_back(self, states, back):
         """Where the camera stood at an earlier frame, as seen from the last one: yaw, ahead, left."""
+        back = min(back, self.spec["context"] - 1)
         if self.pose_channels and len(states) > back:
             (x, y, heading), (there_x, there_y, there) = (self.pose_in(states[at]) for at in (-1, -1 - back))
             sin, cos, x, y = np.sin(heading), np.cos(heading), there_x - x, there_y - y

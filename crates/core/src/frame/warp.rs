@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 use super::FrameError;
 
 /// Depths below this are treated as this deep, so that what is beside or behind the camera lands far outside the frame.
-const MIN_DEPTH: f32 = 1e-3;
+pub(crate) const MIN_DEPTH: f32 = 1e-3;
 
 /// How a pinhole camera with square pixels projects. It looks ahead of the robot, tilted down.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -54,8 +54,10 @@ impl CameraModel {
     pub(crate) const USUAL: Self = Self {
         horizontal_fov_rad: 1.05,
         tilt_down_rad: 0.2,
-        height_m: Some(0.3),
+        height_m: Some(Self::USUAL_HEIGHT_M),
     };
+    /// Height of a camera whose height is not known.
+    pub(crate) const USUAL_HEIGHT_M: f32 = 0.3;
 
     /// A camera of that field of view and tilt, in radians, at an unknown height. Errors: `Camera` if one is out of range.
     pub fn new(horizontal_fov_rad: f32, tilt_down_rad: f32) -> Result<Self, FrameError> {
@@ -94,7 +96,7 @@ pub struct CameraView {
     tilt_sin: f32,
     tilt_cos: f32,
     /// Size of a pixel at depth 1.
-    pixel_size: f32,
+    pub(crate) pixel_size: f32,
     middle_column: f32,
     middle_row: f32,
 }
@@ -125,15 +127,26 @@ impl CameraView {
         ]
     }
 
+    /// The ray of each pixel of a frame of that size, row by row.
+    pub fn rays(&self, width: usize, height: usize) -> impl Iterator<Item = [f32; 3]> + '_ {
+        (0..height).flat_map(move |row| (0..width).map(move |column| self.ray(column, row)))
+    }
+
+    /// Depth of a point, and how far it lies below the camera's axis.
+    #[inline]
+    pub(crate) fn depth_and_down(&self, [ahead, _, up]: [f32; 3]) -> [f32; 2] {
+        [
+            self.tilt_cos * ahead - self.tilt_sin * up,
+            -(self.tilt_sin * ahead + self.tilt_cos * up),
+        ]
+    }
+
     /// The place [column, row] of a point. One beside or behind the camera lies far outside the frame.
     #[must_use]
-    pub fn project(&self, [ahead, left, up]: [f32; 3]) -> [f32; 2] {
-        let depth = (self.tilt_cos * ahead - self.tilt_sin * up).max(MIN_DEPTH);
-        let down = -(self.tilt_sin * ahead + self.tilt_cos * up);
-        [
-            self.middle_column - left / (depth * self.pixel_size),
-            self.middle_row + down / (depth * self.pixel_size),
-        ]
+    pub fn project(&self, point: [f32; 3]) -> [f32; 2] {
+        let [depth, down] = self.depth_and_down(point);
+        let scale = depth.max(MIN_DEPTH) * self.pixel_size;
+        [self.middle_column - point[1] / scale, self.middle_row + down / scale]
     }
 }
 
@@ -143,15 +156,11 @@ impl CameraView {
 pub fn rotation_grid(camera: CameraModel, width: usize, height: usize, yaw_rad: f32) -> Vec<[f32; 2]> {
     let view = CameraView::new(camera, width, height);
     let (yaw_sin, yaw_cos) = yaw_rad.sin_cos();
-    let mut grid = Vec::with_capacity(width * height);
-    for row in 0..height {
-        for column in 0..width {
-            // The pixel's ray after the turn, in the robot's axes then and in those before the turn.
-            let [ahead, left, up] = view.ray(column, row);
-            grid.push(view.project([yaw_cos * ahead - yaw_sin * left, yaw_sin * ahead + yaw_cos * left, up]));
-        }
-    }
-    grid
+    // Each ray after the turn, in the robot's axes then and in those before the turn.
+    let place = |[ahead, left, up]: [f32; 3]| {
+        view.project([yaw_cos * ahead - yaw_sin * left, yaw_sin * ahead + yaw_cos * left, up])
+    };
+    view.rays(width, height).map(place).collect()
 }
 
 /// Which points of a grid lie inside a frame of that size.

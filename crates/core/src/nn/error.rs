@@ -64,6 +64,9 @@ pub enum NnError {
         /// The conditioning.
         conditioning: Conditioning,
     },
+    /// Two forms of the flow network at once.
+    #[error("model specification: flow.recurrent and flow.depth are both true; a network has one of these forms")]
+    RecurrentDepth,
     /// No camera has this field of view or tilt.
     #[error("model specification: {0}")]
     Camera(#[source] crate::frame::FrameError),

@@ -18,25 +18,29 @@ pub(super) fn range_warnings(manifest: &Manifest, inputs: &[ConditioningInput]) 
     let spec = &manifest.spec;
     // A pose that only says how the camera has moved may have any origin.
     let read = spec.states_read_by_layers();
-    let mut warnings = Vec::new();
-    for channel in read {
-        let (channels, ranges) = (
-            spec.states.get(channel..=channel),
-            calibration.states.get(channel..=channel),
-        );
-        let (Some(channels), Some(ranges)) = (channels, ranges) else {
-            continue;
-        };
-        let values: Vec<&[f32]> = states.iter().filter_map(|state| state.get(channel..=channel)).collect();
-        warnings.extend(warnings_of("state", channels, ranges, &values));
-    }
-    warnings.extend(warnings_of("action", &spec.actions, &calibration.actions, &actions));
+    let all: Vec<usize> = (0..spec.actions.len()).collect();
+    let mut warnings = warnings_of("state", (&spec.states, &read), &calibration.states, &states);
+    warnings.extend(warnings_of(
+        "action",
+        (&spec.actions, &all),
+        &calibration.actions,
+        &actions,
+    ));
     warnings
 }
 
-fn warnings_of(kind: &str, channels: &[ChannelScale], ranges: &[ValueRange], vectors: &[&[f32]]) -> Vec<String> {
+/// Of the channels whose indices are given.
+fn warnings_of(
+    kind: &str,
+    (channels, indices): (&[ChannelScale], &[usize]),
+    ranges: &[ValueRange],
+    vectors: &[&[f32]],
+) -> Vec<String> {
     let mut warnings = Vec::new();
-    for (index, (channel, range)) in channels.iter().zip(ranges).enumerate() {
+    for &index in indices {
+        let (Some(channel), Some(range)) = (channels.get(index), ranges.get(index)) else {
+            continue;
+        };
         let excess = |value: f32| (range.min - value).max(value - range.max);
         let values = vectors.iter().filter_map(|vector| vector.get(index).copied());
         let farthest = values
@@ -68,7 +72,7 @@ mod tests {
         let range = ValueRange { min: 0.0, max: 0.5 };
         let warnings = |values: &[f32]| {
             let vectors: Vec<&[f32]> = values.chunks(1).collect();
-            warnings_of("action", std::slice::from_ref(&channel), &[range], &vectors)
+            warnings_of("action", (std::slice::from_ref(&channel), &[0]), &[range], &vectors)
         };
         assert_eq!(warnings(&[0.0, 0.5]), Vec::<String>::new());
         assert_eq!(

@@ -8,7 +8,7 @@ use sha2::{Digest, Sha256};
 use super::check::{check_description, check_episode};
 use super::frame_store::frame_file::FrameFile;
 use super::frame_store::{FrameContent, FrameStore};
-use super::{DatasetError, DatasetInfo, Episode, EpisodeData};
+use super::{DatasetError, DatasetInfo, Episode, EpisodeData, Window};
 use foreframe_core::frame::Frame;
 use foreframe_core::frame::warp::CameraModel;
 use foreframe_sim::CameraConfig;
@@ -134,6 +134,12 @@ impl Dataset {
         let own = trial.and_then(|trial| trial.room.as_ref()).map(|room| &room.camera);
         let simulated = own.or_else(|| self.info.common_camera());
         simulated.map(CameraConfig::model_with_height).or(self.info.camera)
+    }
+
+    /// The camera of each window; empty unless all are known.
+    pub fn cameras<'a>(&self, windows: impl IntoIterator<Item = &'a Window>) -> Vec<CameraModel> {
+        let cameras = windows.into_iter().map(|window| self.camera(window.episode));
+        cameras.collect::<Option<_>>().unwrap_or_default()
     }
 
     /// The intensities of a frame, row by row: borrowed from memory, or read from the file of decoded frames. Panics if there

@@ -168,10 +168,7 @@ impl<'a> Inference<'a> {
             let earlier = earlier.map(|frame| dataset.state(frame)).collect::<Vec<_>>().concat();
             condition.past_states = Some(Tensor::from_vec(earlier, (batch, last, count), &Device::Cpu)?);
         }
-        condition.cameras = windows
-            .iter()
-            .map_while(|window| dataset.camera(window.episode))
-            .collect();
+        condition.cameras = dataset.cameras(windows);
         Ok(condition)
     }
 }

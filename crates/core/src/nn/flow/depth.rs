@@ -59,7 +59,6 @@ impl FlowNetwork {
             frame_of: context_of.clone(),
             room: RoomPlaces::Tracked,
         };
-        // The composition's tensor has the place before the turn first.
         let frames = composition.compose(&head, &no_content, &places)?;
         let level = |part: usize| -> Result<Tensor, NnError> {
             let levels: Vec<f32> = context_of

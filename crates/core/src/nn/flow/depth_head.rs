@@ -4,7 +4,7 @@ use candle_core::{Device, Tensor};
 use candle_nn::Module as _;
 
 use super::blocks::coarse_places;
-use super::depth_views::{DepthViews, PLACE_VALUES as KNOWN_VALUES};
+use super::depth_views::{DepthViews, KNOWN_VALUES};
 use super::reprojection::PLACE_VALUES;
 use crate::nn::error::NnError;
 use crate::nn::model_tensors::ModelTensors;
@@ -22,9 +22,12 @@ pub(super) const MIXED_VALUES: usize = KNOWN_VALUES + 1;
 pub(super) const FINE_VALUES: usize = KNOWN_VALUES + 2;
 /// Largest logarithm of the estimated depth over the one before anything is learned.
 const MAX_LOGARITHM: f64 = 1.5;
-/// Pixels outside the frame that count as 1, and the most that count.
+/// Pixels outside the frame that count as 1.
 const OUTSIDE_PX: f32 = 8.0;
+/// The most that counts of them.
 const MAX_OUTSIDE: f32 = 4.0;
+/// Least depth whose inverse the fine layers read, in metres.
+const LEAST_DEPTH_M: f32 = 0.05;
 
 /// The layers that estimate depth.
 #[derive(Clone, Debug)]
@@ -68,7 +71,7 @@ impl SeenPlaces {
         Self {
             room: pixels.clone().flat_map(|place| [place[2], place[3]]).collect(),
             coarse: coarse_places(places, PLACE_VALUES, 2, size),
-            inverse_depths: pixels.map(|place| 1.0 / place[4].max(0.05)).collect(),
+            inverse_depths: pixels.map(|place| 1.0 / place[4].max(LEAST_DEPTH_M)).collect(),
         }
     }
 
@@ -82,14 +85,13 @@ impl SeenPlaces {
         let (half, quarter) = (size.shrunk(2), size.shrunk(4));
         let mut values = Vec::with_capacity(context_of.len() * quarter.pixels() * MIXED_VALUES);
         for (item, &context) in context_of.iter().enumerate() {
-            let known = &views.places[context as usize * half.pixels() * KNOWN_VALUES..];
+            let known = &views.known[context as usize * half.pixels() * KNOWN_VALUES..];
             let seen = &self.coarse[item * quarter.pixels() * 2..];
             for (place, own) in own_places(quarter).chunks_exact(2).enumerate() {
                 // The upper left block of the place's four.
                 let block = 2 * own[1] as usize * half.width + 2 * own[0] as usize;
                 values.extend_from_slice(&known[block * KNOWN_VALUES..(block + 1) * KNOWN_VALUES]);
-                let is_seen = (-0.5..=quarter.width as f32 - 0.5).contains(&seen[2 * place])
-                    && (-0.5..=quarter.height as f32 - 0.5).contains(&seen[2 * place + 1]);
+                let is_seen = quarter.shows([seen[2 * place], seen[2 * place + 1]]);
                 values.push(f32::from(u8::from(is_seen)));
             }
         }
@@ -110,14 +112,13 @@ impl SeenPlaces {
         let (half, pixels) = (size.shrunk(2), size.pixels());
         let mut values = Vec::with_capacity(context_of.len() * half.pixels() * FINE_VALUES);
         for (item, &context) in context_of.iter().enumerate() {
-            let known = &views.places[context as usize * half.pixels() * KNOWN_VALUES..];
+            let known = &views.known[context as usize * half.pixels() * KNOWN_VALUES..];
             for block in 0..half.pixels() {
                 values.extend_from_slice(&known[block * KNOWN_VALUES..(block + 1) * KNOWN_VALUES]);
                 // The block's upper left pixel.
                 let pixel = item * pixels + block / half.width * 2 * size.width + block % half.width * 2;
                 values.push(self.inverse_depths[pixel]);
-                let beyond = |at: f32, side: usize| (-at).max(at - (side as f32 - 1.0)).max(0.0);
-                let outside = beyond(self.room[2 * pixel], size.width) + beyond(self.room[2 * pixel + 1], size.height);
+                let outside = size.outside([self.room[2 * pixel], self.room[2 * pixel + 1]]);
                 values.push((outside / OUTSIDE_PX).min(MAX_OUTSIDE));
             }
         }

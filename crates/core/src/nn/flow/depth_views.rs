@@ -12,18 +12,18 @@ use crate::nn::geometry::camera::{Viewer, rotated};
 use crate::nn::ops::sampling::ImageSize;
 use crate::vectorized::vectorized;
 
-/// Height of a camera whose height is not known.
-const USUAL_HEIGHT_M: f32 = 0.3;
 /// Distance of everything that the floor does not explain, before anything is learned.
 const WALL_M: f32 = 2.2;
 /// The change of depth whose shift the encoder reads.
 const FARTHER: f32 = 1.25;
 /// Pixels of shift that count as 1.
 const SHIFT_PX: f32 = 4.0;
+/// The most that counts of them: what is behind the camera would shift without end.
+const MAX_SHIFT: f32 = 4.0;
 /// Smallest spread of a frame's intensities.
 const MIN_SPREAD: f32 = 0.04;
-/// Values of a place: column, row, inverse of the depth before anything is learned.
-pub(super) const PLACE_VALUES: usize = 3;
+/// What is known of a 2×2 block: column, row, inverse of the depth before anything is learned.
+pub(super) const KNOWN_VALUES: usize = 3;
 
 /// The contexts as the encoder reads them.
 pub(super) struct DepthViews {
@@ -35,8 +35,8 @@ pub(super) struct DepthViews {
     pub(super) levels: Vec<[f32; 2]>,
     /// Depth before anything is learned `[contexts, P]`, in metres.
     pub(super) depths: Vec<f32>,
-    /// Column, row and inverse depth of each 2×2 block `[contexts, H/2, W/2, PLACE_VALUES]`.
-    pub(super) places: Vec<f32>,
+    /// Column, row and inverse depth of each 2×2 block `[contexts, H/2, W/2, KNOWN_VALUES]`.
+    pub(super) known: Vec<f32>,
     /// The cameras.
     pub(super) viewers: Vec<Viewer>,
 }
@@ -44,7 +44,7 @@ pub(super) struct DepthViews {
 impl DepthViews {
     /// Channels of the inputs: 2×2 blocks of the frames read, the shift of each earlier one, and the place.
     pub(super) fn channels(frames_read: usize) -> usize {
-        4 * frames_read + 2 * (frames_read - 1) + PLACE_VALUES
+        4 * frames_read + 2 * (frames_read - 1) + KNOWN_VALUES
     }
 
     pub(super) fn of(contexts: &EncoderViews) -> Self {
@@ -56,18 +56,18 @@ impl DepthViews {
             frames: contexts.last_frames.clone(),
             levels: Vec::new(),
             depths: Vec::new(),
-            places: Vec::new(),
+            known: Vec::new(),
             viewers: Vec::new(),
         };
         let earlier = contexts.frames_read - 1;
         for index in 0..contexts.count() {
             let camera = contexts.cameras[index].unwrap_or(CameraModel::USUAL);
             let viewer = Viewer::new(camera, size);
-            let depths = depths_before_learning(viewer, camera.height_m.unwrap_or(USUAL_HEIGHT_M));
+            let depths = depths_before_learning(viewer, camera.height_m.unwrap_or(CameraModel::USUAL_HEIGHT_M));
             let frame = &mut views.frames[index * pixels..(index + 1) * pixels];
             let levels = levels(frame);
             count_from(frame, levels);
-            let places = places(size, &depths);
+            let known = known(size, &depths);
             let inputs = &mut views.inputs[index * half.pixels() * channels..][..half.pixels() * channels];
             put_blocks(frame, size, inputs, 0);
             for back in 0..earlier {
@@ -79,10 +79,10 @@ impl DepthViews {
                 put_blocks(&moved, size, inputs, 4 * (back + 1));
                 put(&shifts, 2, inputs, 4 * (earlier + 1) + 2 * back);
             }
-            put(&places, PLACE_VALUES, inputs, channels - PLACE_VALUES);
+            put(&known, KNOWN_VALUES, inputs, channels - KNOWN_VALUES);
             views.levels.push(levels);
             views.depths.extend(depths);
-            views.places.extend(places);
+            views.known.extend(known);
             views.viewers.push(viewer);
         }
         views
@@ -113,17 +113,17 @@ fn depths_before_learning(viewer: Viewer, height_m: f32) -> Vec<f32> {
 }
 
 /// Column, row and inverse depth of each 2×2 block.
-fn places(size: ImageSize, depths: &[f32]) -> Vec<f32> {
+fn known(size: ImageSize, depths: &[f32]) -> Vec<f32> {
     let half = size.shrunk(2);
-    let mut places = Vec::with_capacity(half.pixels() * PLACE_VALUES);
+    let mut known = Vec::with_capacity(half.pixels() * KNOWN_VALUES);
     for row in 0..half.height {
         for column in 0..half.width {
             let depth = |dy: usize, dx: usize| 1.0 / depths[(2 * row + dy) * size.width + 2 * column + dx];
             let inverse = (depth(0, 0) + depth(0, 1) + depth(1, 0) + depth(1, 1)) / 4.0;
-            places.extend([centred(column, half.width), centred(row, half.height), inverse]);
+            known.extend([centred(column, half.width), centred(row, half.height), inverse]);
         }
     }
-    places
+    known
 }
 
 /// An earlier frame in the view of the last one, for those depths; the last one's pixel where it saw nothing. Beside it,
@@ -147,9 +147,7 @@ fn moved_back(
                     viewer.project(rotated(point, sin, cos))
                 };
                 let [x, y] = seen_at(depth);
-                let is_inside =
-                    (-0.5..=size.width as f32 - 0.5).contains(&x) && (-0.5..=size.height as f32 - 0.5).contains(&y);
-                if is_inside {
+                if size.shows([x, y]) {
                     moved[pixel] = size.around(x, y).sample(earlier);
                 }
                 let farther = seen_at(FARTHER * depth);
@@ -162,10 +160,10 @@ fn moved_back(
     (moved, shifts)
 }
 
-/// A quarter of a pixel's shift, limited: what is behind the camera would shift without end.
+/// What a pixel's shift adds to the mean of its block's four.
 #[inline(always)]
 fn shift(pixels: f32) -> f32 {
-    (pixels / SHIFT_PX).clamp(-4.0, 4.0) / 4.0
+    (pixels / SHIFT_PX).clamp(-MAX_SHIFT, MAX_SHIFT) / 4.0
 }
 
 /// Writes each 2×2 block of a frame to four channels of its place, from channel `first` on.
@@ -201,10 +199,10 @@ mod tests {
         let depths = depths_before_learning(viewer, 0.5);
         let lowest = viewer.rays()[SIZE.pixels() - 1];
         assert!((depths[SIZE.pixels() - 1] * lowest[2] + 0.5).abs() < 1e-5);
-        assert!((depths[0] * lowest_hypot(viewer.rays()[0]) - WALL_M).abs() < 1e-4);
+        assert!((depths[0] * level_length(viewer.rays()[0]) - WALL_M).abs() < 1e-4);
     }
 
-    fn lowest_hypot([ahead, left, _]: [f32; 3]) -> f32 {
+    fn level_length([ahead, left, _]: [f32; 3]) -> f32 {
         ahead.hypot(left)
     }
 

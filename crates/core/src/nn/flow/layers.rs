@@ -102,7 +102,7 @@ fn layer_sizes(spec: &ModelSpec, flow: &FlowSpec) -> Vec<LayerSize> {
             layer(&format!("encoder.{index}.{part}"), TAPS * channels, channels, quarter);
         }
     }
-    let (actions, states) = (spec.action_inputs(), StateChannels::read_by_layers(spec).len());
+    let (actions, states) = (spec.action_inputs(), spec.states_read_by_layers().len());
     let known = states + horizon * actions.unwrap_or(0);
     if actions.is_some() {
         layer("motion.inputs", known, MOTION_HIDDEN, 1);

@@ -7,6 +7,7 @@
 
 use candle_core::{Result, Shape, Tensor, bail};
 
+use crate::frame::warp::MIN_DEPTH;
 use crate::nn::fused::{FusedOperation, Operand, apply};
 use crate::nn::geometry::camera::{Viewer, rotated};
 use crate::nn::ops::sampling::{ImageSize, Neighbourhood};
@@ -86,13 +87,18 @@ fn found(viewer: Viewer, size: ImageSize, depths: &[f32], motion: Motion, direct
         let point = motion.point(direction, found.depth);
         let [x, y] = viewer.project(point);
         found.around = size.around(x, y);
-        let factor = found.around.sample(depths) / viewer.depth(point);
+        let factor = found.around.sample(depths) / viewer.depth(point).max(MIN_DEPTH);
         found.depth *= factor.clamp(CORRECTION[0], CORRECTION[1]);
     }
     found
 }
 
 impl Reprojection {
+    /// The rays of each context's camera.
+    fn rays(&self) -> Vec<Vec<[f32; 3]>> {
+        self.viewers.iter().map(|viewer| viewer.rays()).collect()
+    }
+
     fn check(&self, depths: Operand, motions: Operand) -> Result<()> {
         let (contexts, pixels) = depths.layout.shape().dims2()?;
         let fits = contexts == self.viewers.len()
@@ -112,7 +118,7 @@ impl FusedOperation<2> for Reprojection {
     fn forward(&self, [depths, motions]: [Operand; 2]) -> Result<(Vec<f32>, Shape)> {
         self.check(depths, motions)?;
         let (items, pixels) = (self.context_of.len(), self.size.pixels());
-        let rays: Vec<Vec<[f32; 3]>> = self.viewers.iter().map(|viewer| viewer.rays()).collect();
+        let rays = self.rays();
         let mut out = vec![0.0; items * pixels * PLACE_VALUES];
         let outs = out.chunks_exact_mut(pixels * PLACE_VALUES);
         for ((out, motion), &context) in outs.zip(motions.values.chunks_exact(3)).zip(&self.context_of) {
@@ -143,7 +149,7 @@ impl FusedOperation<2> for Reprojection {
         gradient: Operand,
     ) -> Result<[Option<Vec<f32>>; 2]> {
         let pixels = self.size.pixels();
-        let rays: Vec<Vec<[f32; 3]>> = self.viewers.iter().map(|viewer| viewer.rays()).collect();
+        let rays = self.rays();
         let (mut for_depths, mut for_motions) = (vec![0.0; depths.values.len()], vec![0.0; motions.values.len()]);
         for (item, &context) in self.context_of.iter().enumerate() {
             let context = context as usize;

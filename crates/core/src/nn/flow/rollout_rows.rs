@@ -63,7 +63,7 @@ impl<'a> RolloutRows<'a> {
             states,
             past_states,
             cameras,
-            read: StateChannels::read_by_layers(spec),
+            read: spec.states_read_by_layers(),
         })
     }
 
@@ -112,10 +112,12 @@ impl<'a> RolloutRows<'a> {
     pub(super) fn motion_back(&self, row: usize, back: usize) -> [f32; 3] {
         let channels = StateChannels::of(self.spec);
         let (state, past) = (self.state(row), self.of_rows(&self.past_states, row..row + 1));
-        let earlier = (past.len() / state.len().max(1)).checked_sub(back);
-        if let (Some(frame), Some(_)) = (earlier, channels.pose) {
-            let earlier = channels.pose_in(&past[frame * state.len()..(frame + 1) * state.len()]);
-            let motion = self.pose(row).motion_to(earlier);
+        // Beyond the context, its first frame repeats.
+        let back = back.min(self.spec.context - 1);
+        let mut earlier = past.chunks_exact(state.len().max(1));
+        let earlier = back.checked_sub(1).and_then(|nth| earlier.nth_back(nth));
+        if let (Some(earlier), Some(_)) = (earlier, channels.pose) {
+            let motion = self.pose(row).motion_to(channels.pose_in(earlier));
             if motion.iter().all(|part| part.is_finite()) {
                 return motion;
             }

@@ -7,13 +7,10 @@
 
 use candle_core::{Result, Shape, Tensor};
 
-use crate::frame::warp::CameraModel;
+use crate::frame::warp::{CameraModel, CameraView, MIN_DEPTH};
 use crate::nn::fused::{FusedOperation, Operand, apply};
 use crate::nn::ops::sampling::ImageSize;
 use crate::vectorized::vectorized;
-
-/// Depths below this count as this deep, so that what is behind the camera lands far outside the frame.
-const MIN_DEPTH: f32 = 1e-3;
 
 /// Where a camera stands on the floor and where it looks.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -50,55 +47,28 @@ impl CameraPose {
 /// A camera that takes frames of some size.
 #[derive(Clone, Copy, Debug)]
 pub(in crate::nn) struct Viewer {
-    tilt_sin: f32,
-    tilt_cos: f32,
-    /// Size of a pixel at depth 1.
-    pixel: f32,
+    view: CameraView,
     size: ImageSize,
 }
 
 impl Viewer {
     pub(in crate::nn) fn new(camera: CameraModel, size: ImageSize) -> Self {
-        let (tilt_sin, tilt_cos) = camera.tilt_down_rad.sin_cos();
         Self {
-            tilt_sin,
-            tilt_cos,
-            pixel: 2.0 * (camera.horizontal_fov_rad / 2.0).tan() / size.width as f32,
+            view: CameraView::new(camera, size.width, size.height),
             size,
         }
     }
 
     /// The ray of each pixel in the robot's axes, row by row; 1 long along the camera's axis.
     pub(in crate::nn) fn rays(self) -> Vec<[f32; 3]> {
-        let ImageSize { height, width } = self.size;
-        let pixels = (0..height).flat_map(|row| (0..width).map(move |column| (column, row)));
-        pixels
-            .map(|(column, row)| {
-                let right = (column as f32 + 0.5 - width as f32 / 2.0) * self.pixel;
-                let down = (row as f32 + 0.5 - height as f32 / 2.0) * self.pixel;
-                [
-                    self.tilt_cos - down * self.tilt_sin,
-                    -right,
-                    -self.tilt_sin - down * self.tilt_cos,
-                ]
-            })
-            .collect()
-    }
-
-    /// Depth of a point in the robot's axes, and how far it lies below the camera's axis.
-    #[inline(always)]
-    fn depth_and_down(self, [ahead, _, up]: [f32; 3]) -> [f32; 2] {
-        [
-            self.tilt_cos * ahead - self.tilt_sin * up,
-            -(self.tilt_sin * ahead + self.tilt_cos * up),
-        ]
+        self.view.rays(self.size.width, self.size.height).collect()
     }
 
     /// The place of a point in the robot's axes.
     #[inline(always)]
     pub(in crate::nn) fn project(self, point: [f32; 3]) -> [f32; 2] {
-        let [depth, down] = self.depth_and_down(point);
-        let scale = 1.0 / (depth.max(MIN_DEPTH) * self.pixel);
+        let [depth, down] = self.view.depth_and_down(point);
+        let scale = 1.0 / (depth.max(MIN_DEPTH) * self.view.pixel_size);
         [
             (self.size.width as f32 - 1.0) / 2.0 - point[1] * scale,
             (self.size.height as f32 - 1.0) / 2.0 + down * scale,
@@ -123,21 +93,21 @@ impl Viewer {
         places
     }
 
-    /// Depth of a point in the robot's axes.
+    /// Depth of a point in the robot's axes; of a direction, how the depth changes along it.
     #[inline(always)]
     pub(in crate::nn) fn depth(self, point: [f32; 3]) -> f32 {
-        self.depth_and_down(point)[0].max(MIN_DEPTH)
+        self.view.depth_and_down(point)[0]
     }
 
     /// How the place of a point changes when the point moves along a direction.
     #[inline(always)]
     pub(in crate::nn) fn slope(self, point: [f32; 3], along: [f32; 3]) -> [f32; 2] {
-        let [depth, down] = self.depth_and_down(point);
+        let [depth, down] = self.view.depth_and_down(point);
         if depth <= MIN_DEPTH {
             return [0.0; 2];
         }
-        let [depth_slope, down_slope] = self.depth_and_down(along);
-        let scale = 1.0 / (depth * depth * self.pixel);
+        let [depth_slope, down_slope] = self.view.depth_and_down(along);
+        let scale = 1.0 / (depth * depth * self.view.pixel_size);
         [
             -(along[1] * depth - point[1] * depth_slope) * scale,
             (down_slope * depth - down * depth_slope) * scale,

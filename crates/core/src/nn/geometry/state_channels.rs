@@ -61,15 +61,6 @@ impl StateChannels {
         self.measured[1].map(|channel| state[channel])
     }
 
-    /// Channels of the state that the network's layers read: not the pose, where it only says how the camera has moved.
-    pub(in crate::nn) fn read_by_layers(spec: &ModelSpec) -> Vec<usize> {
-        let has_depth = spec.flow().is_some_and(|flow| flow.layers.depth);
-        let pose = Self::of(spec).pose.filter(|_| has_depth).unwrap_or([usize::MAX; 4]);
-        (0..spec.state_inputs().unwrap_or(0))
-            .filter(|channel| !pose.contains(channel))
-            .collect()
-    }
-
     /// Forward speed and yaw rate in a state, if both are measured.
     pub(in crate::nn) fn measured_speeds_in(self, state: &[f32]) -> Option<[f32; 2]> {
         match self.measured {
@@ -122,7 +113,10 @@ impl StateChannels {
 impl ModelSpec {
     /// The state's channels whose values count: all, but for the pose where it only says how the camera has moved.
     pub(crate) fn states_read_by_layers(&self) -> Vec<usize> {
-        StateChannels::read_by_layers(self)
+        let relative = StateChannels::of(self).pose.filter(|_| self.reads_past_states());
+        (0..self.state_inputs().unwrap_or(0))
+            .filter(|channel| relative.is_none_or(|pose| !pose.contains(channel)))
+            .collect()
     }
 
     /// Whether a prediction uses the states at the context's earlier frames: it says from the poses how the camera has moved.

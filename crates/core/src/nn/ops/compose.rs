@@ -32,6 +32,7 @@ pub(in crate::nn) struct Composition {
     pub(in crate::nn) frames: Vec<f32>,
     /// Which of them each item moves, `[M]`.
     pub(in crate::nn) frame_of: Vec<u32>,
+    /// Where it moves the room's pixels from.
     pub(in crate::nn) room: RoomPlaces,
 }
 
@@ -122,10 +123,8 @@ impl Composition {
 
     /// The logit that a place outside the frame costs.
     #[inline(always)]
-    fn outside(&self, [x, y]: [f32; 2]) -> f32 {
-        let beyond = |at: f32, side: usize| (-at).max(at - (side as f32 - 1.0)).max(0.0);
-        let distance = beyond(x, self.size.width) + beyond(y, self.size.height);
-        (OUTSIDE_LOGIT * distance).min(MAX_OUTSIDE_LOGIT)
+    fn outside(&self, place: [f32; 2]) -> f32 {
+        (OUTSIDE_LOGIT * self.size.outside(place)).min(MAX_OUTSIDE_LOGIT)
     }
 
     fn check(&self, inputs: [Operand; 3]) -> Result<()> {
@@ -190,8 +189,7 @@ impl FusedOperation<3> for Composition {
                     #[inline(always)]
                     |[pixel, head, content], parts, frame| {
                         let gradient = gradient.values[pixel];
-                        let moved = parts.gradient(gradient, frame, &mut for_head[head..head + HEAD_VALUES]);
-                        let [room, turned] = moved;
+                        let [room, turned] = parts.gradient(gradient, frame, &mut for_head[head..head + HEAD_VALUES]);
                         let at = &mut for_places[pixel * values..(pixel + 1) * values];
                         add(&mut at[..2], turned);
                         match &self.room {

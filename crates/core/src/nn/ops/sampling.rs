@@ -38,6 +38,19 @@ impl ImageSize {
         }
     }
 
+    /// Whether a place lies on a pixel.
+    #[inline(always)]
+    pub(in crate::nn) fn shows(self, [x, y]: [f32; 2]) -> bool {
+        (-0.5..=self.width as f32 - 0.5).contains(&x) && (-0.5..=self.height as f32 - 0.5).contains(&y)
+    }
+
+    /// How far a place lies outside the middles of the border's pixels: columns plus rows.
+    #[inline(always)]
+    pub(in crate::nn) fn outside(self, [x, y]: [f32; 2]) -> f32 {
+        let beyond = |at: f32, side: usize| (-at).max(at - (side as f32 - 1.0)).max(0.0);
+        beyond(x, self.width) + beyond(y, self.height)
+    }
+
     /// Around the place [column, row], counted from the first pixel's middle; beyond the border, the border's pixel.
     #[inline(always)]
     pub(in crate::nn) fn around(self, x: f32, y: f32) -> Neighbourhood {

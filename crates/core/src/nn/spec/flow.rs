@@ -66,14 +66,17 @@ impl Default for FlowLayers {
 }
 
 impl FlowSpec {
-    /// Errors: `Camera`, and those of the layers, for a model with this conditioning and frames of this width and height.
+    /// Errors: `Camera`, `RecurrentActions`, `RecurrentDepth`, `FrameSides` and those of the layers, for a model with this conditioning and frames of this width and height.
     pub(super) fn check(&self, conditioning: Conditioning, sides_px: [u32; 2]) -> Result<(), NnError> {
         if let Some(camera) = &self.camera {
             camera.validate().map_err(NnError::Camera)?;
         }
         self.layers.check_sizes()?;
-        if self.layers.recurrent && (conditioning.has_actions() || self.layers.depth) {
+        if self.layers.recurrent && conditioning.has_actions() {
             return Err(NnError::RecurrentActions { conditioning });
+        }
+        if self.layers.recurrent && self.layers.depth {
+            return Err(NnError::RecurrentDepth);
         }
         let [least, most] = SIDES_PX;
         let fits = |side: u32| (least..=most).contains(&side) && side.is_multiple_of(least);

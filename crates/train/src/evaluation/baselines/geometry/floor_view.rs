@@ -77,8 +77,7 @@ impl FloorView {
 
     /// The ray of each pixel, row by row.
     fn rays(&self) -> impl Iterator<Item = [f32; 3]> + '_ {
-        let pixels = (0..self.height).flat_map(|row| (0..self.width).map(move |column| (column, row)));
-        pixels.map(|(column, row)| self.view.ray(column, row))
+        self.view.rays(self.width, self.height)
     }
 
     fn column_of(&self, [column, _]: [f32; 2]) -> usize {
