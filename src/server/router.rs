@@ -29,17 +29,12 @@ pub fn router(app: App) -> Router {
         .route_layer(from_fn_with_state(app.requests.clone(), requests::answer))
         .merge(stream_routes())
         .route_layer(from_fn_with_state(app.keys.clone(), keys::check));
-    let inference = inference_protocol::routes()
-        .route_layer(from_fn_with_state(app.requests.clone(), requests::answer))
-        .route_layer(from_fn_with_state(app.keys.clone(), keys::check));
     let (router, contract) = open_routes().merge(api).split_for_parts();
     let document = openapi::text(contract);
     let trace = RequestTrace::new(config, Arc::clone(&app.draining));
     let origins = OriginPolicy::new(config, app.keys.clone());
     router
         .merge(pages::docs())
-        .merge(inference)
-        .merge(inference_protocol::open_routes())
         .layer(Extension(pages::ContractText(document.into())))
         .method_not_allowed_fallback(async || ApiError::MethodNotAllowed)
         .fallback(async || ApiError::NotFound("there is nothing at this path; see /openapi.json".to_owned()))
@@ -69,6 +64,7 @@ fn open_routes() -> OpenApiRouter<App> {
         .merge(pages::routes())
         .merge(health::routes())
         .merge(metrics::routes())
+        .merge(inference_protocol::open_routes())
 }
 
 /// The routes of requests; they need an API key if authentication is on.
@@ -84,6 +80,7 @@ fn request_routes(config: &ServerConfig) -> OpenApiRouter<App> {
         .merge(episodes::routes())
         .merge(environments::routes())
         .merge(audit::routes())
+        .merge(inference_protocol::routes())
 }
 
 /// The routes of streams, which have limits of their own; they need an API key if authentication is on.

@@ -161,3 +161,41 @@ async fn errors_are_problem_details() {
     let detail = send(&app, request.body(Body::empty()).unwrap()).await.detail(415);
     assert!(detail.contains("application/msgpack"), "{detail}");
 }
+
+#[tokio::test]
+async fn limits_and_numbers_are_those_of_json() {
+    let dir = tempfile::tempdir().unwrap();
+    let config = ServerConfig {
+        max_body_bytes: 2048,
+        max_frames: CONTEXT,
+        max_plans: 2,
+        ..ServerConfig::default()
+    };
+    let app = app(dir.path(), config);
+    let plans = |count: usize| PackedBody {
+        plan: None,
+        plans: Some(vec![vec![[0.5, -0.5]; 2]; count]),
+        ..body()
+    };
+    assert_eq!(send_packed(&app, ROLLOUTS, &plans(2), MSGPACK).await.status, 200);
+    send_packed(&app, ROLLOUTS, &plans(3), MSGPACK).await.detail(413);
+    let mut many = body();
+    many.frames.push(many.frames[0].clone());
+    let detail = send_packed(&app, PREDICT, &many, MSGPACK).await.detail(413);
+    assert!(detail.starts_with("frames holds 4"), "{detail}");
+    send_bytes(&app, PREDICT, vec![0; 2049], MSGPACK).await.detail(413);
+    for number in [f32::NAN, f32::INFINITY, 2e30] {
+        let state = PackedBody {
+            state: vec![number],
+            ..body()
+        };
+        let detail = send_packed(&app, PREDICT, &state, MSGPACK).await.detail(422);
+        assert!(detail.starts_with("state"), "{detail}");
+        let plan = PackedBody {
+            plan: Some(vec![[0.5, number]; 2]),
+            ..body()
+        };
+        let detail = send_packed(&app, PREDICT, &plan, MSGPACK).await.detail(422);
+        assert!(detail.starts_with("plan[0]"), "{detail}");
+    }
+}

@@ -42,8 +42,8 @@ pub(in crate::server) trait WithFrames {
     fn push_frame(&mut self, file: Vec<u8>);
 }
 
-/// A body of JSON or `MessagePack`, or a form (`multipart/form-data`): a part `request`, which is the body as JSON, and a part `frames` for each
-/// image, in order. Refused before it is read if there is no place for its prediction.
+/// A body of JSON or `MessagePack`, or a form (`multipart/form-data`): a part `request`, which is the body as JSON, and a part
+/// `frames` for each image, in order. Refused before it is read if there is no place for its prediction.
 pub(in crate::server) struct BodyOrForm<T>(pub(in crate::server) T);
 
 impl<T, S> FromRequest<S> for BodyOrForm<T>

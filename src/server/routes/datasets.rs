@@ -1,5 +1,7 @@
 //! The data sets, and pictures of their episodes.
 
+use std::path::PathBuf;
+
 use axum::body::Bytes;
 use axum::http::{StatusCode, header};
 use axum::response::IntoResponse;
@@ -15,7 +17,7 @@ use crate::server::state::App;
 use foreframe_core::frame::warp::CameraModel;
 use foreframe_core::frame::{Frame, FrameError, codec};
 use foreframe_core::types::{Channel, DatasetName};
-use foreframe_data::dataset::{Dataset, DatasetError};
+use foreframe_data::dataset::{Dataset, DatasetError, DatasetInfo};
 use foreframe_jobs::jobs::{JobError, datasets};
 use foreframe_jobs::store::Author;
 use foreframe_train::evaluation::figures::animation::enlarged_gif;
@@ -180,8 +182,7 @@ async fn describe(app: &App, name: &DatasetName) -> Result<DatasetDescription, A
     })
 }
 
-/// A picture of an episode's frames, given them and the seconds from one to the next. It is kept as long as the data set
-/// has the same content.
+/// A picture of an episode's frames, given them and the seconds from one to the next.
 async fn episode_picture(
     app: &App,
     name: &DatasetName,
@@ -189,17 +190,29 @@ async fn episode_picture(
     kind: &str,
     draw: impl FnOnce(Vec<Frame>, f64) -> Result<Vec<u8>, FrameError> + Send + 'static,
 ) -> Result<Bytes, ApiError> {
-    let info = datasets::describe(app.store().objects(), name).await.map_err(absent)?;
-    let key = format!("dataset/{name}/{}/{episode}.{kind}", info.content_hash);
-    if let Some(picture) = app.render_cache.cached(&key) {
-        return Ok(picture);
-    }
-    let dir = datasets::fetch(app.store().objects(), name).await.map_err(absent)?;
-    let make = move || {
+    let make = move |info: DatasetInfo, dir: PathBuf| {
         let frames = Dataset::episode_frames(&dir, episode)?;
         draw(frames, info.frame_period_s).map_err(picture::not_drawn)
     };
-    app.render_cache.get_or_make(key, make).await
+    kept(app, name, &format!("{episode}.{kind}"), make).await
+}
+
+/// What `make` makes of a data set, given its description and its local directory: from the cache, where it is kept as long
+/// as the data set has the same content, or made now.
+pub(super) async fn kept(
+    app: &App,
+    name: &DatasetName,
+    part: &str,
+    make: impl FnOnce(DatasetInfo, PathBuf) -> Result<Vec<u8>, ApiError> + Send + 'static,
+) -> Result<Bytes, ApiError> {
+    let objects = app.store().objects();
+    let info = datasets::describe(objects, name).await.map_err(absent)?;
+    let key = format!("dataset/{name}/{}/{part}", info.content_hash);
+    if let Some(bytes) = app.render_cache.cached(&key) {
+        return Ok(bytes);
+    }
+    let dir = datasets::fetch(objects, name).await.map_err(absent)?;
+    app.render_cache.get_or_make(key, move || make(info, dir)).await
 }
 
 /// Frames spread evenly over an episode, in rows, each with its number.
@@ -217,7 +230,7 @@ fn contact_sheet(title: &str, frames: Vec<Frame>) -> Result<Vec<u8>, FrameError>
 }
 
 /// The data set is in the path, so that it does not exist is 404, not 422.
-pub(super) fn absent(error: JobError) -> ApiError {
+fn absent(error: JobError) -> ApiError {
     match error {
         JobError::NotFound { .. } => ApiError::NotFound(error.to_string()),
         other => other.into(),

@@ -1,13 +1,14 @@
 //! What is in a data set: the frames of an episode with their actions and states, and the page of its inspection.
 
-use axum::body::Bytes;
+use std::path::PathBuf;
+
 use axum::http::header;
 use axum::response::IntoResponse;
 use serde::{Deserialize, Serialize};
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
-use super::datasets::{absent, dataset_name};
+use super::datasets::{dataset_name, kept};
 use super::picture;
 use crate::server::http::extract::{Path, Query};
 use crate::server::http::problem::ApiError;
@@ -16,7 +17,6 @@ use crate::server::state::App;
 use foreframe_core::frame::Frame;
 use foreframe_data::dataset::{Dataset, DatasetInfo, EpisodeData};
 use foreframe_data::inspection;
-use foreframe_jobs::jobs::datasets;
 
 pub(in crate::server) fn routes() -> OpenApiRouter<App> {
     OpenApiRouter::new()
@@ -82,17 +82,13 @@ async fn episode(
         return Err(ApiError::Unprocessable(detail));
     }
     let name = dataset_name(&app, &name).await?;
-    let objects = app.store().objects();
-    let info = datasets::describe(objects, &name).await.map_err(absent)?;
     let from = query.from as usize;
-    let key = format!("dataset/{name}/{}/{episode}.{from}+{limit}", info.content_hash);
-    let dir = datasets::fetch(objects, &name).await.map_err(absent)?;
-    let read = move || {
+    let read = move |_: DatasetInfo, dir: PathBuf| {
         let (info, data) = Dataset::read_episode(&dir, episode)?;
         let frames = EpisodeFrames::of(&info, &data, from, limit)?;
         Ok::<_, ApiError>(serde_json::to_vec(&frames).expect("a list of frames that is not JSON is a bug"))
     };
-    let json: Bytes = app.render_cache.get_or_make(key, read).await?;
+    let json = kept(&app, &name, &format!("{episode}.{from}+{limit}"), read).await?;
     Ok(([(header::CONTENT_TYPE, "application/json")], json))
 }
 
@@ -129,17 +125,13 @@ impl EpisodeFrames {
 )]
 async fn inspection_page(app: App, Path(name): Path<String>) -> Result<impl IntoResponse, ApiError> {
     let name = dataset_name(&app, &name).await?;
-    let objects = app.store().objects();
-    let info = datasets::describe(objects, &name).await.map_err(absent)?;
-    let key = format!("dataset/{name}/{}/inspection", info.content_hash);
-    let dir = datasets::fetch(objects, &name).await.map_err(absent)?;
     let memory_mib = app.config().dataset_memory_mib;
-    let draw = move || {
+    let draw = move |_: DatasetInfo, dir: PathBuf| {
         let dataset = Dataset::open_within(&dir, memory_mib)?;
         let page = inspection::page(&inspection::inspect(&dataset)?, &dataset)?;
         Ok::<_, ApiError>(page.into_bytes())
     };
-    let page = app.render_cache.get_or_make(key, draw).await?;
+    let page = kept(&app, &name, "inspection", draw).await?;
     let headers = [
         (header::CONTENT_TYPE, "text/html; charset=utf-8"),
         (header::CONTENT_SECURITY_POLICY, INSPECTION_POLICY),

@@ -32,13 +32,13 @@ const COMPARED_JOBS: usize = 100;
 struct ServerEvent {
     /// `models`, `jobs` or `stopping`.
     event: String,
-    /// Empty.
+    /// Always `{}`.
     data: String,
 }
 
 /// Sends an event when the list of models or its active versions changed (`event: models`), when the state of a job changed
 /// or a new one came (`event: jobs`), and when the server stops (`event: stopping`). Both lists are announced once at the
-/// beginning. The events have no content: read the list. The stream also ends if the API key is revoked.
+/// beginning. The events do not hold the change: read the list. The stream also ends if the API key is revoked.
 #[utoipa::path(
     get, path = "/v1/events",
     responses(

@@ -33,13 +33,19 @@ pub(in crate::server) async fn livez() -> axum::Json<Health> {
     responses((status = 200, body = Health), (status = 503, description = "Not ready"))
 )]
 async fn readyz(app: App) -> Result<axum::Json<Health>, ApiError> {
+    check_predicts(&app)?;
+    ready(app.store()).await
+}
+
+/// Errors: `Unavailable` if the server is stopping, or a model has not made its first prediction yet.
+pub(super) fn check_predicts(app: &App) -> Result<(), ApiError> {
     if app.draining.load(Ordering::Acquire) {
         return Err(ApiError::unavailable("the server is stopping"));
     }
     if !app.predictor().is_ready() {
         return Err(ApiError::unavailable("the models are warming up"));
     }
-    ready(app.store()).await
+    Ok(())
 }
 
 /// Whether the store can be written.

@@ -17,7 +17,7 @@ use crate::server::routes::{predict, rollouts};
 use crate::server::state::App;
 use foreframe_core::frame::Frame;
 use foreframe_core::registry::{Manifest, Model};
-use foreframe_core::serving::{Prediction, PredictionInput, Rollout, Task};
+use foreframe_core::serving::{Prediction, PredictionInput, Rollout, Task, Timing};
 
 /// What is to be computed.
 struct InferenceTask {
@@ -37,16 +37,19 @@ pub(super) async fn infer(
     let (name, version) = (manifest.name.as_str(), manifest.version);
     match &answered {
         Ok((_, timing)) => {
-            let whole = started.elapsed();
-            app.inference_statistics
-                .succeeded(name, version, &InferenceTimes { whole, ..*timing });
+            let times = InferenceTimes {
+                whole: started.elapsed(),
+                queue: Duration::from_micros(timing.queue_us),
+                compute: Duration::from_micros(timing.compute_us),
+            };
+            app.inference_statistics.succeeded(name, version, &times);
         }
         Err(_) => app.inference_statistics.failed(name, version, started.elapsed()),
     }
     answered.map(|(response, _)| response)
 }
 
-async fn answer(app: &App, model: &Arc<Model>, request: InferRequest) -> Result<(Response, InferenceTimes), ApiError> {
+async fn answer(app: &App, model: &Arc<Model>, request: InferRequest) -> Result<(Response, Timing), ApiError> {
     let _place = app.admission.enter()?;
     let (manifest, config) = (Arc::clone(&model.manifest), Arc::clone(&app.config));
     let names: Vec<&str> = metadata::outputs(&manifest).iter().map(|field| field.name).collect();
@@ -60,16 +63,12 @@ async fn answer(app: &App, model: &Arc<Model>, request: InferRequest) -> Result<
         has_plans,
     } = app.predictions.run(read).await??;
     let prediction = app.predictor().compute(model, task, None).await?;
-    let times = InferenceTimes {
-        whole: Duration::ZERO,
-        queue: Duration::from_micros(prediction.timing.queue_us),
-        compute: Duration::from_micros(prediction.timing.compute_us),
-    };
+    let timing = prediction.timing;
     let write = move || {
         let warnings = prediction.warnings.clone();
         answer.respond(&manifest, outputs(prediction, is_float, has_plans), &warnings)
     };
-    Ok((app.predictions.run(write).await?, times))
+    Ok((app.predictions.run(write).await?, timing))
 }
 
 impl InferenceTask {

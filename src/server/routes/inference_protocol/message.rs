@@ -6,10 +6,10 @@ use axum::body::Bytes;
 use axum::extract::{FromRequest, Request};
 use axum::http::{HeaderName, header};
 use axum::response::{IntoResponse, Response};
-use serde::Deserialize;
-use serde_json::{Value, json};
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
 
-use super::tensor::{InputHead, Tensor};
+use super::tensor::{InputHead, OutputHead, Tensor};
 use crate::server::http::problem::ApiError;
 use crate::server::state::App;
 use foreframe_core::registry::Manifest;
@@ -45,6 +45,22 @@ struct RequestedOutput {
 #[derive(Default, Deserialize)]
 struct OutputParameters {
     binary_data: Option<bool>,
+}
+
+#[derive(Serialize)]
+struct AnswerHead<'a> {
+    model_name: &'a str,
+    model_version: String,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    id: Option<String>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    parameters: Option<AnswerParameters>,
+    outputs: Vec<OutputHead<'a>>,
+}
+
+#[derive(Serialize)]
+struct AnswerParameters {
+    warnings: String,
 }
 
 /// A request for an inference. Refused before it is read if there is no place for its prediction.
@@ -163,18 +179,16 @@ impl AnswerForm {
                 .collect()
         };
         let described = chosen.iter().map(|(tensor, is_binary)| tensor.described(*is_binary));
-        let mut head = json!({
-            "model_name": manifest.name,
-            "model_version": manifest.version.to_string(),
-            "outputs": described.collect::<Value>(),
+        let head = serde_json::to_vec(&AnswerHead {
+            model_name: manifest.name.as_str(),
+            model_version: manifest.version.to_string(),
+            id: self.id,
+            parameters: (!warnings.is_empty()).then(|| AnswerParameters {
+                warnings: warnings.join("; "),
+            }),
+            outputs: described.collect(),
         });
-        if let Some(id) = self.id {
-            head["id"] = json!(id);
-        }
-        if !warnings.is_empty() {
-            head["parameters"] = json!({"warnings": warnings.join("; ")});
-        }
-        let mut body = head.to_string().into_bytes();
+        let mut body = head.expect("an answer that is not JSON is a bug");
         if !chosen.iter().any(|(_, is_binary)| *is_binary) {
             return ([(header::CONTENT_TYPE, "application/json")], body).into_response();
         }

@@ -1,7 +1,6 @@
 //! What the server and its models are: metadata, readiness, configuration, statistics.
 
 use std::sync::Arc;
-use std::sync::atomic::Ordering;
 
 use axum::Json;
 use axum::extract::FromRequestParts;
@@ -13,6 +12,7 @@ use super::tensor::{Datatype, Field};
 use crate::server::http::extract::Path;
 use crate::server::http::problem::ApiError;
 use crate::server::inference_statistics::DurationSum;
+use crate::server::routes::health;
 use crate::server::state::App;
 use foreframe_core::nn::ModelSpec;
 use foreframe_core::registry::{Manifest, Model};
@@ -31,13 +31,7 @@ pub(super) async fn server() -> Json<Value> {
 pub(super) async fn live() {}
 
 pub(super) async fn ready(app: App) -> Result<(), ApiError> {
-    if app.draining.load(Ordering::Acquire) {
-        return Err(ApiError::unavailable("the server is stopping"));
-    }
-    if !app.predictor().is_ready() {
-        return Err(ApiError::unavailable("the models are warming up"));
-    }
-    Ok(())
+    health::check_predicts(&app)
 }
 
 pub(super) async fn index(app: App) -> Json<Value> {

@@ -3,8 +3,7 @@
 use std::fmt;
 
 use serde::de::{DeserializeSeed, SeqAccess, Visitor};
-use serde::{Deserialize, Deserializer};
-use serde_json::{Value, json};
+use serde::{Deserialize, Deserializer, Serialize};
 
 use crate::server::http::problem::ApiError;
 
@@ -57,8 +56,9 @@ impl Field {
     }
 }
 
-/// Values in row-major order.
-#[derive(Clone, Debug, PartialEq)]
+/// Values in row-major order; in JSON, a list.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+#[serde(untagged)]
 pub(super) enum Values {
     Uint8(Vec<u8>),
     Fp32(Vec<f32>),
@@ -87,6 +87,23 @@ pub(super) struct InputHead {
 struct InputParameters {
     binary_data_size: Option<usize>,
     shared_memory_region: Option<String>,
+}
+
+/// The head of an output in an answer. It borrows the values: as JSON values, they would take many times their memory.
+#[derive(Debug, Serialize)]
+pub(super) struct OutputHead<'a> {
+    name: &'a str,
+    datatype: &'static str,
+    shape: &'a [usize],
+    #[serde(skip_serializing_if = "Option::is_none")]
+    parameters: Option<BinarySize>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    data: Option<&'a Values>,
+}
+
+#[derive(Debug, Serialize)]
+struct BinarySize {
+    binary_data_size: usize,
 }
 
 impl Tensor {
@@ -143,22 +160,20 @@ impl Tensor {
     }
 
     /// The tensor as an output; `is_binary`: without its values, which [`Tensor::into_bytes`] gives.
-    pub(super) fn described(&self, is_binary: bool) -> Value {
-        let datatype = match self.values {
-            Values::Uint8(_) => Datatype::Uint8,
-            Values::Fp32(_) => Datatype::Fp32,
+    pub(super) fn described(&self, is_binary: bool) -> OutputHead<'_> {
+        let (datatype, count) = match &self.values {
+            Values::Uint8(values) => (Datatype::Uint8, values.len()),
+            Values::Fp32(values) => (Datatype::Fp32, values.len()),
         };
-        let mut described = json!({"name": self.name, "datatype": datatype.name(), "shape": self.shape});
-        if is_binary {
-            let count: usize = self.shape.iter().product();
-            described["parameters"] = json!({"binary_data_size": count * datatype.bytes()});
-        } else {
-            described["data"] = match &self.values {
-                Values::Uint8(values) => json!(values),
-                Values::Fp32(values) => json!(values),
-            };
+        OutputHead {
+            name: &self.name,
+            datatype: datatype.name(),
+            shape: &self.shape,
+            parameters: is_binary.then(|| BinarySize {
+                binary_data_size: count * datatype.bytes(),
+            }),
+            data: (!is_binary).then_some(&self.values),
         }
-        described
     }
 
     /// The values, little-endian.
