@@ -160,7 +160,7 @@ mod tests {
         let error = TrainConfig::preset("papper").unwrap_err().to_string();
         assert_eq!(
             error,
-            "there is no preset \"papper\"; there are: paper, static, moving, static-flow, moving-flow, recording, \
+            "there is no preset \"papper\"; there are: paper, static, moving, static-flow, moving-flow, rooms, recording, \
              moving-mnist"
         );
     }

@@ -98,6 +98,11 @@ impl InferenceTask {
                 known.join(", ")
             )));
         }
+        if plan.is_some() && plans.is_some() {
+            return Err(ApiError::Unprocessable(
+                "plan and plans are both given; give one".to_owned(),
+            ));
+        }
         let has_plans = plans.is_some();
         let (past_states, state) = predict::states(state, None, frames.len())?;
         let task = if let Some(plans) = plans {
