@@ -1,6 +1,6 @@
 """Trains a small agent in the dream of a model, then lets it drive the simulator.
 
-    pip install 'foreframe[gym]'
+    pip install './python[gym]'
     python python/examples/train_in_dream.py
 
 The task: keep the other robot in the middle of the view. The agent sees the picture only: how much of the other robot is in each of

@@ -54,6 +54,18 @@ def test_files_and_frames_of_another_size_are_encoded(client: foreframe.Client, 
         client.predict(MODEL, large / 255.0)
 
 
+def test_a_model_that_estimates_depth_reads_the_state_at_each_frame(client: foreframe.Client, drive: Drive) -> None:
+    plan = drive.actions[4:9]
+    predicted = client.predict("rooms", drive.frames[:5], states=drive.states[:5], plan=plan)
+    found = client.rollouts("rooms", drive.frames[:5], [plan], states=drive.states[:5])
+    with client.session("rooms") as session:
+        for n in range(5):
+            answer = session.step(drive.frames[n], action=drive.actions[n], state=drive.states[n], plan=plan)
+    assert answer.prediction is not None
+    for frames in (predicted.frames, found.frames[0]):
+        assert np.abs(frames.astype(int) - answer.prediction.frames).max() <= 1
+
+
 def test_a_png_is_read_as_it_was_written(drive: Drive) -> None:
     assert np.array_equal(decode_png(encode_png(drive.frames[0])), drive.frames[0])
 
@@ -93,6 +105,13 @@ def test_a_server_with_keys_wants_one(tmp_path) -> None:
                 stranger.session("moving-flow").step(np.zeros((64, 64), np.uint8))
         with server.client(key=key) as known, known.session("static-flow") as session:
             assert session.step(np.zeros((64, 64), np.uint8)).have == 1
+
+
+def test_a_key_that_no_header_can_hold_is_refused_without_telling_it() -> None:
+    for key in ("ffk_secret\n", "ffk_secret…"):
+        with pytest.raises(ValueError, match="API key") as refused:
+            foreframe.Client(key=key)
+        assert "secret" not in str(refused.value)
 
 
 def test_a_job_is_followed_to_its_end(client: foreframe.Client) -> None:

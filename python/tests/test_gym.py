@@ -32,6 +32,14 @@ def test_the_dream_passes_the_check(client: foreframe.Client) -> None:
     starts.close()
 
 
+@pytest.mark.parametrize("context", [1, 5])
+def test_a_start_has_an_action_between_each_two_frames(client: foreframe.Client, context: int) -> None:
+    starts = SimulatorStarts(client, context)
+    start = starts(np.random.default_rng(1))
+    starts.close()
+    assert (len(start.frames), len(start.actions), len(start.states)) == (context, context - 1, context)
+
+
 def test_a_dream_continues_on_its_own_frames(client: foreframe.Client) -> None:
     starts = SimulatorStarts(client, client.spec(MODEL).context)
     env = DreamEnv(client, MODEL, starts, brightness, max_steps=4)

@@ -166,6 +166,14 @@ def test_a_refused_frame_changes_nothing(client: foreframe.Client, drive: Drive,
         client.session("nothing").step(drive.frames[0])
 
 
+def test_a_closed_session_says_so(client: foreframe.Client, drive: Drive) -> None:
+    session = client.session(MODEL)
+    answers(session, drive, range(1))
+    session.close()
+    with pytest.raises(foreframe.StreamClosed, match="^the session is closed$"):
+        answers(session, drive, range(1, 2))
+
+
 def test_a_session_rolls_plans_out_also_after_it_was_lost(client: foreframe.Client, drive: Drive) -> None:
     plans = [np.tile([0.3, turn], (5, 1)) for turn in (-0.5, 0.5)]
     with client.session(MODEL) as session:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Generic, TypeAlias, TypeVar
 from urllib.parse import quote
 
@@ -55,6 +56,19 @@ class Call(Generic[T]):
         return self.read(json.loads(content) if content else None)
 
 
+def path(*parts: str | int) -> str:
+    return "/".join(("/v1", *(quote(str(part), safe="") for part in parts)))
+
+
+def authorization(key: str | None) -> dict[str, str]:
+    """The header of an API key. Raises ValueError, which does not tell the key, for a key that no header can hold."""
+    if key is None:
+        return {}
+    if not (key.isascii() and key.isprintable()):
+        raise ValueError("the API key has a line break or another character that no key has")
+    return {"Authorization": f"Bearer {key}"}
+
+
 def numbers(values: Any) -> Any:
     """Numbers as nested lists, whatever kind of array they are in."""
     return None if values is None else np.asarray(values, np.float64).tolist()
@@ -66,15 +80,15 @@ def given(**fields: Any) -> dict[str, Any]:
 
 
 def models(after: str | None) -> Call[tuple[list[Model], str | None]]:
-    return Call("GET", "/v1/models", _page("models", Model.of), params=given(after=after))
+    return Call("GET", path("models"), _page("models", Model.of), params=given(after=after))
 
 
 def model(name: str) -> Call[Model]:
-    return Call("GET", f"/v1/models/{quote(name, safe='')}", Model.of)
+    return Call("GET", path("models", name), Model.of)
 
 
 def activate(name: str, version: int) -> Call[Model]:
-    return Call("POST", f"/v1/models/{quote(name, safe='')}/versions/{version}/activate", Model.of)
+    return Call("POST", path("models", name, "versions", version, "activate"), Model.of)
 
 
 def predict(
@@ -84,6 +98,7 @@ def predict(
     *,
     actions: Vectors | None,
     state: Vector | None,
+    states: Vectors | None,
     plan: Vectors | None,
     steps: int | None,
     resize: str | None,
@@ -94,12 +109,13 @@ def predict(
         format=image_format,
         actions=numbers(actions),
         state=numbers(state),
+        states=numbers(states),
         plan=numbers(plan),
         steps=steps,
         resize=resize,
     )
-    path = f"/v1/models/{quote(name, safe='')}/predict"
-    return Call("POST", path, lambda answer: Prediction.of(answer, spec.size), body, is_binary=True)
+    read = partial(Prediction.of, size=spec.size)
+    return Call("POST", path("models", name, "predict"), read, body, is_binary=True)
 
 
 def rollouts(
@@ -109,6 +125,7 @@ def rollouts(
     plans: Plans,
     *,
     state: Vector | None,
+    states: Vectors | None,
     steps: int | None,
     resize: str | None,
 ) -> Call[Rollouts]:
@@ -118,80 +135,81 @@ def rollouts(
         format=image_format,
         plans=[numbers(plan) for plan in plans],
         state=numbers(state),
+        states=numbers(states),
         steps=steps,
         resize=resize,
     )
-    path = f"/v1/models/{quote(name, safe='')}/rollouts"
-    return Call("POST", path, lambda answer: Rollouts.of(answer, spec.size), body, is_binary=True)
+    read = partial(Rollouts.of, size=spec.size)
+    return Call("POST", path("models", name, "rollouts"), read, body, is_binary=True)
 
 
 def session_rollouts(
     session: str, token: str, spec: Spec, plans: Plans, *, state: Vector | None, steps: int | None
 ) -> Call[Rollouts]:
     body = given(format="raw", plans=[numbers(plan) for plan in plans], state=numbers(state), steps=steps)
-    path, headers = f"/v1/sessions/{session}/rollouts", {"x-session-token": token}
-    return Call("POST", path, lambda answer: Rollouts.of(answer, spec.size), body, headers=headers, is_binary=True)
+    read, headers = partial(Rollouts.of, size=spec.size), {"x-session-token": token}
+    return Call("POST", path("sessions", session, "rollouts"), read, body, headers=headers, is_binary=True)
 
 
 def create_session(model_name: str, resize: str | None) -> Call[Mapping[str, Any]]:
-    return Call("POST", "/v1/sessions", dict, given(model=model_name, format="raw", resize=resize))
+    return Call("POST", path("sessions"), dict, given(model=model_name, format="raw", resize=resize))
 
 
 def delete_session(session: str, token: str) -> Call[None]:
-    return Call("DELETE", f"/v1/sessions/{session}", _nothing, headers={"x-session-token": token})
+    return Call("DELETE", path("sessions", session), _nothing, headers={"x-session-token": token})
 
 
 def datasets(after: str | None) -> Call[tuple[list[Dataset], str | None]]:
-    return Call("GET", "/v1/datasets", _page("datasets", Dataset.of), params=given(after=after))
+    return Call("GET", path("datasets"), _page("datasets", Dataset.of), params=given(after=after))
 
 
 def dataset(name: str) -> Call[Dataset]:
-    return Call("GET", f"/v1/datasets/{quote(name, safe='')}", Dataset.of)
+    return Call("GET", path("datasets", name), Dataset.of)
 
 
 def delete_dataset(name: str) -> Call[None]:
-    return Call("DELETE", f"/v1/datasets/{quote(name, safe='')}", _nothing)
+    return Call("DELETE", path("datasets", name), _nothing)
 
 
 def jobs(kind: str | None, state: str | None, limit: int | None) -> Call[list[Job]]:
     read = _page("jobs", Job.of)
-    return Call("GET", "/v1/jobs", lambda body: read(body)[0], params=given(kind=kind, state=state, limit=limit))
+    return Call("GET", path("jobs"), lambda body: read(body)[0], params=given(kind=kind, state=state, limit=limit))
 
 
 def job(job_id: str) -> Call[Job]:
-    return Call("GET", f"/v1/jobs/{quote(job_id, safe='')}", Job.of)
+    return Call("GET", path("jobs", job_id), Job.of)
 
 
 def submit(spec: Mapping[str, Any], idempotency_key: str | None) -> Call[Job]:
     headers = {} if idempotency_key is None else {"Idempotency-Key": idempotency_key}
-    return Call("POST", "/v1/jobs", Job.of, given(**spec), headers=headers)
+    return Call("POST", path("jobs"), Job.of, given(**spec), headers=headers)
 
 
 def change_job(job_id: str, change: str) -> Call[Job]:
-    return Call("POST", f"/v1/jobs/{quote(job_id, safe='')}/{change}", Job.of)
+    return Call("POST", path("jobs", job_id, change), Job.of)
 
 
 def logs(job_id: str, after: int) -> Call[list[LogLine]]:
     def read(body: Mapping[str, Any]) -> list[LogLine]:
         return [LogLine.of(line) for line in body["lines"]]
 
-    return Call("GET", f"/v1/jobs/{quote(job_id, safe='')}/logs", read, params={"after": after})
+    return Call("GET", path("jobs", job_id, "logs"), read, params={"after": after})
 
 
 def create_environment(scenario: str, seed: int, world: Mapping[str, Any] | None) -> Call[Mapping[str, Any]]:
-    return Call("POST", "/v1/environments", dict, given(scenario=scenario, seed=seed, world=world))
+    return Call("POST", path("environments"), dict, given(scenario=scenario, seed=seed, world=world))
 
 
 def reset_environment(environment: str, seed: int | None) -> Call[Mapping[str, Any]]:
-    return Call("POST", f"/v1/environments/{environment}/reset", dict, given(seed=seed))
+    return Call("POST", path("environments", environment, "reset"), dict, given(seed=seed))
 
 
 def step_environment(environment: str, action: Vector) -> Call[Mapping[str, Any]]:
-    return Call("POST", f"/v1/environments/{environment}/step", dict, {"action": numbers(action)})
+    return Call("POST", path("environments", environment, "step"), dict, {"action": numbers(action)})
 
 
 def delete_environment(environment: str) -> Call[None]:
-    return Call("DELETE", f"/v1/environments/{environment}", _nothing)
+    return Call("DELETE", path("environments", environment), _nothing)
 
 
 def _page(name: str, of: Callable[[Mapping[str, Any]], T]) -> Callable[[Any], tuple[list[T], str | None]]:

@@ -1,27 +1,32 @@
-"""The client: one method for each call of the server. `AsyncClient` has the same methods as coroutines."""
+"""The client: one method for each call of the server. `AsyncClient` has them as coroutines."""
 
 from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
+from functools import partial
 from types import TracebackType
-from typing import Any, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import httpx
 import numpy as np
 from numpy.typing import NDArray
 
 from . import calls
-from .calls import Call, Plans, Vector, Vectors
+from .calls import Call, Plans, Vector, Vectors, authorization
 from .environment import Environment
 from .errors import ConnectionFailed, JobFailed, api_error
 from .events import EventReader
+from .flow import follow, follow_async
 from .images import FrameLike
-from .records import Dataset, Job, LogLine, Model, Prediction, Rollouts, Spec
+from .records import Dataset, Job, LogLine, Model, Predicted, Prediction, Rollouts, Spec
 from .session import AsyncSession, Session
 
 T = TypeVar("T")
+P = TypeVar("P", bound=Predicted)
+#: Several calls, of which one may need the answer to another.
+Flow: TypeAlias = "Generator[Call[Any], Any, T]"
 
 DEFAULT_URL = "http://127.0.0.1:8642"
 #: How long to wait before the events of a job are read again after a break, in seconds.
@@ -38,31 +43,52 @@ def _result(call: Call[T], response: httpx.Response) -> T:
     return call.result(response.content)
 
 
-def _authorization(key: str | None) -> dict[str, str]:
-    return {} if key is None else {"Authorization": f"Bearer {key}"}
+def _request(call: Call[Any]) -> dict[str, Any]:
+    return {
+        "method": call.method,
+        "url": call.path,
+        "params": dict(call.params),
+        "content": call.content(),
+        "headers": call.all_headers(),
+    }
 
 
 class _Specs:
     """The specs of models, so that a prediction needs one request."""
 
     def __init__(self) -> None:
-        self._known: dict[str, tuple[int, Spec]] = {}
+        self._known: dict[str, Model] = {}
 
-    def get(self, name: str) -> Spec | None:
-        known = self._known.get(name)
-        return known[1] if known else None
-
-    def put(self, model: Model) -> Spec:
-        self._known[model.name] = (model.active_version, model.spec)
+    def find(self, name: str) -> Flow[Spec]:
+        model = self._known.get(name)
+        if model is None:
+            model = self._known[name] = yield calls.model(name)
         return model.spec
 
-    def check(self, name: str, version: int) -> None:
-        """Forgets a model of which another version has answered."""
-        if name in self._known and self._known[name][0] != version:
-            del self._known[name]
+    def predicted(self, name: str, call_with: Callable[[Spec], Call[P]]) -> Flow[P]:
+        """The answer to a call that needs the model's spec."""
+        call = call_with((yield from self.find(name)))
+        try:
+            found: P = yield call
+        except Exception:
+            # Another version may have become active, with other frames.
+            self.forget(name)
+            raise
+        model = self._known.get(name)
+        if model is not None and model.active_version != found.version:
+            self.forget(name)
+        return found
 
     def forget(self, name: str) -> None:
         self._known.pop(name, None)
+
+
+def _all(page: Callable[[str | None], Call[tuple[list[T], str | None]]]) -> Flow[list[T]]:
+    found, after = yield page(None)
+    while after is not None:
+        more, after = yield page(after)
+        found += more
+    return list(found)
 
 
 class Client:
@@ -74,7 +100,7 @@ class Client:
     def __init__(self, url: str = DEFAULT_URL, *, key: str | None = None, timeout_s: float = 30.0) -> None:
         self.url = url.rstrip("/")
         self.key = key
-        self._http = httpx.Client(base_url=self.url, headers=_authorization(key), timeout=timeout_s)
+        self._http = httpx.Client(base_url=self.url, headers=authorization(key), timeout=timeout_s)
         self._specs = _Specs()
 
     def __enter__(self) -> Client:
@@ -90,20 +116,17 @@ class Client:
     def run(self, call: Call[T]) -> T:
         """Makes a call. Raises ApiError or ConnectionFailed."""
         try:
-            response = self._http.request(
-                call.method,
-                call.path,
-                params=dict(call.params),
-                content=call.content(),
-                headers=call.all_headers(),
-            )
+            response = self._http.request(**_request(call))
         except httpx.TransportError as error:
             raise _unreachable(self.url, error) from error
         return _result(call, response)
 
+    def _follow(self, flow: Flow[T]) -> T:
+        return follow(flow, self.run)
+
     def spec(self, model: str) -> Spec:
         """What a model takes and gives; asked for once."""
-        return self._specs.get(model) or self._specs.put(self.model(model))
+        return self._follow(self._specs.find(model))
 
     def predict(
         self,
@@ -112,6 +135,7 @@ class Client:
         *,
         actions: Vectors | None = None,
         state: Vector | None = None,
+        states: Vectors | None = None,
         plan: Vectors | None = None,
         steps: int | None = None,
         resize: str | None = None,
@@ -119,14 +143,21 @@ class Client:
         """Predicts the frames after ``frames``, the model's context, oldest first.
 
         ``plan``: the future actions; without it, the last of ``actions`` is repeated. ``state``: at the last frame.
-        ``resize``: ``crop``, ``letterbox`` or ``stretch``, for frames of another size.
+        ``states``: at each of ``frames``, instead of ``state``; a model that estimates depth reads all of them. ``resize``:
+        ``crop``, ``letterbox`` or ``stretch``, for frames of another size.
         """
-        call = calls.predict(
-            model, self.spec(model), frames, actions=actions, state=state, plan=plan, steps=steps, resize=resize
+        call = partial(
+            calls.predict,
+            model,
+            frames=frames,
+            actions=actions,
+            state=state,
+            states=states,
+            plan=plan,
+            steps=steps,
+            resize=resize,
         )
-        prediction = self._of_known_spec(model, call)
-        self._specs.check(model, prediction.version)
-        return prediction
+        return self._follow(self._specs.predicted(model, call))
 
     def rollouts(
         self,
@@ -135,22 +166,15 @@ class Client:
         plans: Plans,
         *,
         state: Vector | None = None,
+        states: Vectors | None = None,
         steps: int | None = None,
         resize: str | None = None,
     ) -> Rollouts:
         """Predicts the frames of each of ``plans`` ``[plans, steps, action]`` from one context."""
-        call = calls.rollouts(model, self.spec(model), frames, plans, state=state, steps=steps, resize=resize)
-        found = self._of_known_spec(model, call)
-        self._specs.check(model, found.version)
-        return found
-
-    def _of_known_spec(self, model: str, call: Call[T]) -> T:
-        try:
-            return self.run(call)
-        except Exception:
-            # Another version may have become active, with other frames.
-            self._specs.forget(model)
-            raise
+        call = partial(
+            calls.rollouts, model, frames=frames, plans=plans, state=state, states=states, steps=steps, resize=resize
+        )
+        return self._follow(self._specs.predicted(model, call))
 
     def session(self, model: str, *, resize: str | None = None, reconnect_s: float = 30.0) -> Session:
         """A session: send frame after frame, get a prediction after each. See :class:`Session`."""
@@ -158,7 +182,7 @@ class Client:
 
     def models(self) -> list[Model]:
         """All models."""
-        return self._all(calls.models)
+        return self._follow(_all(calls.models))
 
     def model(self, name: str) -> Model:
         """One model."""
@@ -171,7 +195,7 @@ class Client:
 
     def datasets(self) -> list[Dataset]:
         """All data sets."""
-        return self._all(calls.datasets)
+        return self._follow(_all(calls.datasets))
 
     def dataset(self, name: str) -> Dataset:
         """One data set."""
@@ -180,13 +204,6 @@ class Client:
     def delete_dataset(self, name: str) -> None:
         """Deletes a data set."""
         self.run(calls.delete_dataset(name))
-
-    def _all(self, page: Callable[[str | None], Call[tuple[list[T], str | None]]]) -> list[T]:
-        found, after = self.run(page(None))
-        while after is not None:
-            more, after = self.run(page(after))
-            found += more
-        return found
 
     def jobs(self, *, kind: str | None = None, state: str | None = None, limit: int | None = None) -> list[Job]:
         """The newest jobs."""
@@ -261,7 +278,7 @@ class _Watched:
         on_log: Callable[[LogLine], None] | None,
         timeout_s: float | None,
     ) -> None:
-        self.path = f"/v1/jobs/{job_id}/events"
+        self.path = calls.path("jobs", job_id, "events")
         self.over: Job | None = None
         self._job_id = job_id
         self._on_progress = on_progress
@@ -305,12 +322,12 @@ class _Watched:
 
 
 class AsyncClient:
-    """As :class:`Client`, with coroutines."""
+    """As :class:`Client`, with coroutines, but without ``environment``."""
 
     def __init__(self, url: str = DEFAULT_URL, *, key: str | None = None, timeout_s: float = 30.0) -> None:
         self.url = url.rstrip("/")
         self.key = key
-        self._http = httpx.AsyncClient(base_url=self.url, headers=_authorization(key), timeout=timeout_s)
+        self._http = httpx.AsyncClient(base_url=self.url, headers=authorization(key), timeout=timeout_s)
         self._specs = _Specs()
 
     async def __aenter__(self) -> AsyncClient:
@@ -328,20 +345,17 @@ class AsyncClient:
     async def run(self, call: Call[T]) -> T:
         """Makes a call. Raises ApiError or ConnectionFailed."""
         try:
-            response = await self._http.request(
-                call.method,
-                call.path,
-                params=dict(call.params),
-                content=call.content(),
-                headers=call.all_headers(),
-            )
+            response = await self._http.request(**_request(call))
         except httpx.TransportError as error:
             raise _unreachable(self.url, error) from error
         return _result(call, response)
 
+    async def _follow(self, flow: Flow[T]) -> T:
+        return await follow_async(flow, self.run)
+
     async def spec(self, model: str) -> Spec:
         """What a model takes and gives; asked for once."""
-        return self._specs.get(model) or self._specs.put(await self.model(model))
+        return await self._follow(self._specs.find(model))
 
     async def predict(
         self,
@@ -350,16 +364,24 @@ class AsyncClient:
         *,
         actions: Vectors | None = None,
         state: Vector | None = None,
+        states: Vectors | None = None,
         plan: Vectors | None = None,
         steps: int | None = None,
         resize: str | None = None,
     ) -> Prediction:
         """As :meth:`Client.predict`."""
-        spec = await self.spec(model)
-        call = calls.predict(model, spec, frames, actions=actions, state=state, plan=plan, steps=steps, resize=resize)
-        prediction = await self._of_known_spec(model, call)
-        self._specs.check(model, prediction.version)
-        return prediction
+        call = partial(
+            calls.predict,
+            model,
+            frames=frames,
+            actions=actions,
+            state=state,
+            states=states,
+            plan=plan,
+            steps=steps,
+            resize=resize,
+        )
+        return await self._follow(self._specs.predicted(model, call))
 
     async def rollouts(
         self,
@@ -368,22 +390,15 @@ class AsyncClient:
         plans: Plans,
         *,
         state: Vector | None = None,
+        states: Vectors | None = None,
         steps: int | None = None,
         resize: str | None = None,
     ) -> Rollouts:
         """As :meth:`Client.rollouts`."""
-        spec = await self.spec(model)
-        call = calls.rollouts(model, spec, frames, plans, state=state, steps=steps, resize=resize)
-        found = await self._of_known_spec(model, call)
-        self._specs.check(model, found.version)
-        return found
-
-    async def _of_known_spec(self, model: str, call: Call[T]) -> T:
-        try:
-            return await self.run(call)
-        except Exception:
-            self._specs.forget(model)
-            raise
+        call = partial(
+            calls.rollouts, model, frames=frames, plans=plans, state=state, states=states, steps=steps, resize=resize
+        )
+        return await self._follow(self._specs.predicted(model, call))
 
     def session(self, model: str, *, resize: str | None = None, reconnect_s: float = 30.0) -> AsyncSession:
         """As :meth:`Client.session`."""
@@ -391,22 +406,32 @@ class AsyncClient:
 
     async def models(self) -> list[Model]:
         """All models."""
-        return await self._all(calls.models)
+        return await self._follow(_all(calls.models))
 
     async def model(self, name: str) -> Model:
         """One model."""
         return await self.run(calls.model(name))
 
+    async def activate(self, model: str, version: int) -> Model:
+        """Makes a version the active one."""
+        self._specs.forget(model)
+        return await self.run(calls.activate(model, version))
+
     async def datasets(self) -> list[Dataset]:
         """All data sets."""
-        return await self._all(calls.datasets)
+        return await self._follow(_all(calls.datasets))
 
-    async def _all(self, page: Callable[[str | None], Call[tuple[list[T], str | None]]]) -> list[T]:
-        found, after = await self.run(page(None))
-        while after is not None:
-            more, after = await self.run(page(after))
-            found += more
-        return found
+    async def dataset(self, name: str) -> Dataset:
+        """One data set."""
+        return await self.run(calls.dataset(name))
+
+    async def delete_dataset(self, name: str) -> None:
+        """Deletes a data set."""
+        await self.run(calls.delete_dataset(name))
+
+    async def jobs(self, *, kind: str | None = None, state: str | None = None, limit: int | None = None) -> list[Job]:
+        """The newest jobs."""
+        return await self.run(calls.jobs(kind, state, limit))
 
     async def job(self, job_id: str) -> Job:
         """A job and its progress."""
@@ -419,6 +444,14 @@ class AsyncClient:
     async def cancel(self, job_id: str) -> Job:
         """Cancels a job."""
         return await self.run(calls.change_job(job_id, "cancel"))
+
+    async def resume(self, job_id: str) -> Job:
+        """Resumes a failed or cancelled job."""
+        return await self.run(calls.change_job(job_id, "resume"))
+
+    async def logs(self, job_id: str, *, after: int = 0) -> list[LogLine]:
+        """Up to 1000 lines of a job's log."""
+        return await self.run(calls.logs(job_id, after))
 
     async def wait(
         self,

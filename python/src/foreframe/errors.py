@@ -53,11 +53,11 @@ class StreamError(ForeframeError):
 
 
 class StreamClosed(ForeframeError):
-    """The server ended a session for good."""
+    """A session has ended for good."""
 
     def __init__(self, reason: str) -> None:
-        super().__init__(f"the server closed the session: {reason}")
-        #: ``replaced``, ``deleted``, ``revoked`` or ``too_long``.
+        super().__init__("the session is closed" if reason == "closed" else f"the server closed the session: {reason}")
+        #: ``replaced``, ``deleted``, ``revoked`` or ``too_long``; ``closed``: by its own ``close``.
         self.reason = reason
 
 

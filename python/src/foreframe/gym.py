@@ -1,7 +1,7 @@
 """Gymnasium environments: a simulated robot of the server, and a dream, whose dynamics are a model.
 
 Both have the same observations: ``frame`` uint8[height, width, 1] and, if there is one, ``state`` float32. Needs the extra
-``gym``: ``pip install foreframe[gym]``.
+``gym``: ``pip install './python[gym]'`` in a clone of Foreframe.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ class SimulatorEnv(_CameraEnv):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observed, dict[str, Any]]:
         """Begins an episode: with a seed its first, without one the next."""
         super().reset(seed=seed)
-        observation = self._open().reset(None if seed is None else seed)
+        observation = self._open().reset(seed)
         self._frame = observation.frame
         return _observed(observation.frame, observation.state), {"policy_action": observation.policy_action}
 
@@ -168,9 +168,10 @@ class SimulatorStarts:
             if step.terminated or step.truncated:
                 break
         seen = observations[-self._context :]
+        between = actions[len(observations) - len(seen) :]
         return Start(
             frames=np.stack([observed.frame for observed in seen]),
-            actions=np.asarray(actions[-(self._context - 1) :], np.float32),
+            actions=np.asarray(between, np.float32),
             states=np.stack([observed.state for observed in seen]),
         )
 

@@ -19,16 +19,19 @@ _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 def encode_all(frames: Sequence[FrameLike] | Gray, size: tuple[int, int]) -> tuple[str, list[bytes]]:
     """The format and the images of a message. ``size``: the model's height and width. Raw if all frames have that size."""
-    checked = [_checked(f"frames[{index}]", frame) for index, frame in enumerate(frames)]
-    if all(isinstance(frame, np.ndarray) and frame.shape == size for frame in checked):
-        return "raw", [bytes(frame.tobytes()) for frame in checked if isinstance(frame, np.ndarray)]
-    return "png", [frame if isinstance(frame, bytes) else encode_png(frame) for frame in checked]
+    return _encoded([_checked(f"frames[{index}]", frame) for index, frame in enumerate(frames)], size)
 
 
 def encode(frame: FrameLike, size: tuple[int, int]) -> tuple[str, bytes]:
     """As :func:`encode_all`, of one frame."""
-    name, images = encode_all([frame], size)
+    name, images = _encoded([_checked("frame", frame)], size)
     return name, images[0]
+
+
+def _encoded(checked: Sequence[Gray | bytes], size: tuple[int, int]) -> tuple[str, list[bytes]]:
+    if all(isinstance(frame, np.ndarray) and frame.shape == size for frame in checked):
+        return "raw", [bytes(frame.tobytes()) for frame in checked if isinstance(frame, np.ndarray)]
+    return "png", [frame if isinstance(frame, bytes) else encode_png(frame) for frame in checked]
 
 
 def decode_all(images: Sequence[bytes], name: str, size: tuple[int, int]) -> Gray:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .images import Gray, decode_all
+
+P = TypeVar("P", bound="Predicted")
 
 Floats = NDArray[np.float32]
 #: Standard deviations from the mean that bound a channel whose range the server does not tell.
@@ -108,20 +110,20 @@ class Model:
 
 
 @dataclass(frozen=True)
-class Prediction:
+class Predicted:
     """Predicted frames, and how far they can be trusted."""
 
     model: str
     version: int
-    #: ``[steps, height, width]``: t+1, t+2, ….
+    #: ``[…, steps, height, width]``: t+1, t+2, ….
     frames: Gray
-    #: Mean squared error to expect of each frame, intensities 0 to 1; empty if the model is not calibrated.
+    #: ``[…, steps]``: mean squared error to expect of each frame, intensities 0 to 1; empty if the model is not calibrated.
     expected_mse: Floats
-    #: ``[steps, 2]``: the 90 % band of these errors.
+    #: ``[…, steps, 2]``: the 90 % band of these errors.
     mse_band_90: Floats
     #: How unlike the training data the context is, 0 to 1; None if the model is not calibrated.
     novelty: float | None
-    #: For each frame, whether it is beyond what the model was trained for.
+    #: ``[steps]``: whether a frame is beyond what the model was trained for.
     beyond_training: NDArray[np.bool_]
     #: Actions and states out of the range of the training.
     warnings: tuple[str, ...]
@@ -130,54 +132,42 @@ class Prediction:
     compute_ms: float
 
     @classmethod
+    def _with(cls: type[P], frames: Gray, body: Mapping[str, Any]) -> P:
+        steps, timing = frames.shape[-3], body["timing"]
+        return cls(
+            model=body["model"],
+            version=body["version"],
+            frames=frames,
+            expected_mse=np.asarray(body.get("expected_mse", []), np.float32),
+            mse_band_90=np.asarray(body.get("mse_band_90", []), np.float32),
+            novelty=body.get("novelty"),
+            beyond_training=np.asarray(body.get("beyond_training") or [False] * steps, bool),
+            warnings=tuple(body.get("warnings", ())),
+            queue_ms=timing["queue_us"] / 1000,
+            compute_ms=timing["compute_us"] / 1000,
+        )
+
+
+class Prediction(Predicted):
+    """The predicted frames ``[steps, height, width]`` after a context."""
+
+    @classmethod
     def of(cls, body: Mapping[str, Any], size: tuple[int, int]) -> Prediction:
-        frames = decode_all(body["frames"], body["format"], size)
-        return cls(frames=frames, **_trust(body, len(frames)))
+        return cls._with(decode_all(body["frames"], body["format"], size), body)
 
 
-@dataclass(frozen=True)
-class Rollouts:
-    """The predicted frames of each plan."""
-
-    model: str
-    version: int
-    #: ``[plans, steps, height, width]``.
-    frames: Gray
-    #: ``[plans, steps]``; empty if the model is not calibrated.
-    expected_mse: Floats
-    #: ``[plans, steps, 2]``.
-    mse_band_90: Floats
-    novelty: float | None
-    beyond_training: NDArray[np.bool_]
-    warnings: tuple[str, ...]
-    queue_ms: float
-    compute_ms: float
+class Rollouts(Predicted):
+    """The predicted frames ``[plans, steps, height, width]`` of each plan."""
 
     @classmethod
     def of(cls, body: Mapping[str, Any], size: tuple[int, int]) -> Rollouts:
         images = [image for rollout in body["rollouts"] for image in rollout]
         steps = len(body["rollouts"][0]) if body["rollouts"] else 0
-        frames = decode_all(images, body["format"], size).reshape(-1, steps, *size)
-        return cls(frames=frames, **_trust(body, steps))
+        return cls._with(decode_all(images, body["format"], size).reshape(-1, steps, *size), body)
 
     def best(self, cost: Callable[[Gray], float]) -> int:
         """The number of the plan with the least cost; ``cost`` takes the frames ``[steps, height, width]`` of a plan."""
         return int(np.argmin([cost(frames) for frames in self.frames]))
-
-
-def _trust(body: Mapping[str, Any], steps: int) -> dict[str, Any]:
-    timing = body["timing"]
-    return {
-        "model": body["model"],
-        "version": body["version"],
-        "expected_mse": np.asarray(body.get("expected_mse", []), np.float32),
-        "mse_band_90": np.asarray(body.get("mse_band_90", []), np.float32),
-        "novelty": body.get("novelty"),
-        "beyond_training": np.asarray(body.get("beyond_training") or [False] * steps, bool),
-        "warnings": tuple(body.get("warnings", ())),
-        "queue_ms": timing["queue_us"] / 1000,
-        "compute_ms": timing["compute_us"] / 1000,
-    }
 
 
 @dataclass(frozen=True)

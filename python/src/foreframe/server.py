@@ -78,7 +78,7 @@ def serve(
     """
     found = shutil.which(program)
     if found is None:
-        raise ServerNotStarted(f"the program {program} is not on PATH; build it with: cargo install --path .")
+        raise ServerNotStarted(f"the program {program} is not on PATH; install it with `cargo install --path .` in a clone of Foreframe")
     directory = tempfile.TemporaryDirectory(prefix="foreframe-")
     root = Path(directory.name)
     data = root / "data" if data_dir is None else Path(data_dir).absolute()

@@ -5,15 +5,16 @@ from __future__ import annotations
 import asyncio
 import time
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import websockets.asyncio.client
 import websockets.sync.client
 from websockets.exceptions import InvalidStatus, WebSocketException
 from websockets.typing import Subprotocol
 
-from .calls import Call, Plans, Vector, Vectors
+from .calls import Call, Plans, Vector, Vectors, authorization
 from .errors import ApiError, ForeframeError, api_error
+from .flow import follow, follow_async
 from .images import FrameLike
 from .records import Answer, Rollouts, Spec
 from .stream import SUBPROTOCOL, Broken, Flow, Open, Operation, Pause, Receive, Send, SessionFlow, Shut
@@ -21,15 +22,16 @@ from .stream import SUBPROTOCOL, Broken, Flow, Open, Operation, Pause, Receive, 
 if TYPE_CHECKING:
     from .client import AsyncClient, Client
 
+T = TypeVar("T")
+
 #: How long to wait for a handshake or an answer, in seconds.
 ANSWER_S = 30.0
 
 
 def _socket_options(client: Client | AsyncClient) -> dict[str, Any]:
-    key = client.key
     return {
         "subprotocols": [Subprotocol(SUBPROTOCOL)],
-        "additional_headers": {} if key is None else {"Authorization": f"Bearer {key}"},
+        "additional_headers": authorization(client.key),
         "max_size": None,
         "open_timeout": ANSWER_S,
         "close_timeout": 1.0,
@@ -87,15 +89,11 @@ class Session:
         ``plan``: the future actions. Default: ``action``, repeated. Raises StreamError if the server refuses the frame: then
         nothing has changed, and a corrected frame may follow.
         """
-        answer = self._run(self._flow.step(frame, action, state, plan, steps, timestamp_us))
-        assert isinstance(answer, Answer)
-        return answer
+        return self._run(self._flow.step(frame, action, state, plan, steps, timestamp_us))
 
     def rollouts(self, plans: Plans, *, state: Vector | None = None, steps: int | None = None) -> Rollouts:
         """Predicts the frames of each of ``plans`` ``[plans, steps, action]`` from the last frame."""
-        found = self._run(self._flow.rollouts(plans, state, steps))
-        assert isinstance(found, Rollouts)
-        return found
+        return self._run(self._flow.rollouts(plans, state, steps))
 
     def close(self) -> None:
         """Ends the session."""
@@ -108,19 +106,8 @@ class Session:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         self.close()
 
-    def _run(self, flow: Flow) -> Any:
-        result: Any = None
-        failure: BaseException | None = None
-        while True:
-            try:
-                operation = flow.throw(failure) if failure else flow.send(result)
-            except StopIteration as end:
-                return end.value
-            result, failure = None, None
-            try:
-                result = self._perform(operation)
-            except (Broken, ForeframeError) as error:
-                failure = error
+    def _run(self, flow: Flow[T]) -> T:
+        return follow(flow, self._perform)
 
     def _perform(self, operation: Operation) -> Any:
         match operation:
@@ -187,15 +174,11 @@ class AsyncSession:
         timestamp_us: int | None = None,
     ) -> Answer:
         """As :meth:`Session.step`."""
-        answer = await self._run(self._flow.step(frame, action, state, plan, steps, timestamp_us))
-        assert isinstance(answer, Answer)
-        return answer
+        return await self._run(self._flow.step(frame, action, state, plan, steps, timestamp_us))
 
     async def rollouts(self, plans: Plans, *, state: Vector | None = None, steps: int | None = None) -> Rollouts:
         """As :meth:`Session.rollouts`."""
-        found = await self._run(self._flow.rollouts(plans, state, steps))
-        assert isinstance(found, Rollouts)
-        return found
+        return await self._run(self._flow.rollouts(plans, state, steps))
 
     async def close(self) -> None:
         """Ends the session."""
@@ -210,19 +193,8 @@ class AsyncSession:
     ) -> None:
         await self.close()
 
-    async def _run(self, flow: Flow) -> Any:
-        result: Any = None
-        failure: BaseException | None = None
-        while True:
-            try:
-                operation = flow.throw(failure) if failure else flow.send(result)
-            except StopIteration as end:
-                return end.value
-            result, failure = None, None
-            try:
-                result = await self._perform(operation)
-            except (Broken, ForeframeError) as error:
-                failure = error
+    async def _run(self, flow: Flow[T]) -> T:
+        return await follow_async(flow, self._perform)
 
     async def _perform(self, operation: Operation) -> Any:
         match operation:

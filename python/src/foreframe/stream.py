@@ -6,7 +6,7 @@ import time
 from collections import deque
 from collections.abc import Generator, Mapping
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar
 from urllib.parse import quote
 
 import msgpack
@@ -15,7 +15,9 @@ from . import calls
 from .calls import Call, Plans, Vector, Vectors, given, numbers
 from .errors import ApiError, ConnectionFailed, StreamClosed, StreamError, Unavailable
 from .images import FrameLike, encode
-from .records import Answer, Prediction, Spec
+from .records import Answer, Prediction, Rollouts, Spec
+
+T = TypeVar("T")
 
 SUBPROTOCOL = "foreframe.v1.msgpack"
 #: The pauses between two attempts to connect, in seconds.
@@ -57,7 +59,7 @@ class Pause:
 
 #: What a session performs. A call gives its answer, `Receive` the message.
 Operation: TypeAlias = "Open | Shut | Send | Receive | Pause | Call[Any]"
-Flow: TypeAlias = Generator[Operation, Any, Any]
+Flow: TypeAlias = "Generator[Operation, Any, T]"
 
 
 class Broken(Exception):
@@ -87,7 +89,8 @@ class SessionFlow:
         self._id = ""
         self._token = ""
         self._is_open = False
-        self._is_closed = False
+        #: Why the session has ended for good; empty while it has not.
+        self._end = ""
         #: The number of the frame that the server counts as 0.
         self._first_seq = 0
         self._replayed = False
@@ -99,7 +102,7 @@ class SessionFlow:
         """The session's id and token on the server; empty before it is open."""
         return self._id, self._token
 
-    def open(self) -> Flow:
+    def open(self) -> Flow[None]:
         """Connects, if it is not connected."""
         deadline, pause = time.monotonic() + self._reconnect_s, FIRST_PAUSE_S
         while not self._is_open:
@@ -116,7 +119,7 @@ class SessionFlow:
         plan: Vectors | None,
         steps: int | None,
         timestamp_us: int | None,
-    ) -> Flow:
+    ) -> Flow[Answer]:
         """Sends a frame, gives its Answer."""
         yield from self.open()
         assert self.spec is not None
@@ -136,23 +139,20 @@ class SessionFlow:
         self.next_seq += 1
         return self._read(answer)
 
-    def rollouts(self, plans: Plans, state: Vector | None, steps: int | None) -> Flow:
+    def rollouts(self, plans: Plans, state: Vector | None, steps: int | None) -> Flow[Rollouts]:
         """The Rollouts from the last frame."""
-        for is_last in (False, True):
-            yield from self.open()
-            assert self.spec is not None
-            try:
-                found = yield calls.session_rollouts(*self.identity, self.spec, plans, state=state, steps=steps)
-                return found
-            except ApiError as error:
-                if error.status != 404 or is_last:
-                    raise
-                # The server lost the session, and the socket has not broken yet.
-                self._is_open = False
+        try:
+            return (yield from self._rolled_out(plans, state, steps))
+        except ApiError as error:
+            if error.status != 404:
+                raise
+        # The server lost the session, and the socket has not broken yet.
+        self._is_open = False
+        return (yield from self._rolled_out(plans, state, steps))
 
-    def close(self) -> Flow:
+    def close(self) -> Flow[None]:
         """Ends the session on the server, if it can be reached."""
-        self._is_closed = True
+        self._end, self._is_open = "closed", False
         yield Shut()
         if self._id:
             try:
@@ -161,7 +161,13 @@ class SessionFlow:
                 # It is gone already, or ends by itself.
                 pass
 
-    def _answered(self, message: dict[str, Any]) -> Flow:
+    def _rolled_out(self, plans: Plans, state: Vector | None, steps: int | None) -> Flow[Rollouts]:
+        yield from self.open()
+        assert self.spec is not None
+        found: Rollouts = yield calls.session_rollouts(*self.identity, self.spec, plans, state=state, steps=steps)
+        return found
+
+    def _answered(self, message: dict[str, Any]) -> Flow[Mapping[str, Any]]:
         deadline, pause = time.monotonic() + self._reconnect_s, FIRST_PAUSE_S
         while True:
             try:
@@ -173,7 +179,7 @@ class SessionFlow:
                 self._is_open = self._is_open and error.retry_after_s > 0
                 pause = yield from self._wait(error, deadline, pause)
 
-    def _exchange(self, message: dict[str, Any], seq: int) -> Flow:
+    def _exchange(self, message: dict[str, Any], seq: int) -> Flow[Mapping[str, Any]]:
         """Sends a frame; gives the answer to it. If the server knows the frame already, it answers again."""
         try:
             yield Send(msgpack.packb({**message, "seq": seq - self._first_seq}))
@@ -190,20 +196,20 @@ class SessionFlow:
                     raise Broken(answer["detail"], retry_after_s=1.0)
                 raise StreamError(answer["code"], answer["detail"])
 
-    def _receive(self) -> Flow:
+    def _receive(self) -> Flow[Mapping[str, Any]]:
         answer: dict[str, Any] = msgpack.unpackb((yield Receive()))
         if answer["type"] == "closing":
             self._is_open = False
             yield Shut()
             if answer["reason"] in FINAL_REASONS:
-                self._is_closed = True
-                raise StreamClosed(answer["reason"])
+                self._end = answer["reason"]
+                raise StreamClosed(self._end)
             raise Broken(f"the server closed the stream: {answer['reason']}")
         return answer
 
-    def _connect(self) -> Flow:
-        if self._is_closed:
-            raise StreamClosed("closed")
+    def _connect(self) -> Flow[None]:
+        if self._end:
+            raise StreamClosed(self._end)
         yield Shut()
         if self._id:
             try:
@@ -218,7 +224,7 @@ class SessionFlow:
                     raise
         yield from self._begin()
 
-    def _begin(self) -> Flow:
+    def _begin(self) -> Flow[None]:
         """Opens a new session, and sends the context again."""
         try:
             created = yield calls.create_session(self._model, self._resize)
@@ -235,16 +241,16 @@ class SessionFlow:
         self._replayed = bool(self._context)
         self._is_open = True
 
-    def _open_socket(self) -> Flow:
+    def _open_socket(self) -> Flow[Mapping[str, Any]]:
         try:
             yield Open(f"/v1/sessions/{self._id}/stream?token={quote(self._token)}")
         except Unavailable as error:
             raise Broken(error.detail, error.retry_after_s) from error
-        ready: Mapping[str, Any] = yield from self._receive()
+        ready = yield from self._receive()
         self.spec, self.version = Spec.of(ready["spec"]), ready["version"]
         return ready
 
-    def _wait(self, error: Broken, deadline: float, pause: float) -> Flow:
+    def _wait(self, error: Broken, deadline: float, pause: float) -> Flow[float]:
         seconds = max(pause, error.retry_after_s)
         if time.monotonic() + seconds > deadline:
             raise ConnectionFailed(f"the stream broke, and {self._reconnect_s:g} s of attempts were in vain: {error}")
