@@ -172,6 +172,8 @@ def a_dream_goes_on_and_is_saved(browser, server):
     assert saved.startswith(b"GIF89a") and saved.count(b"\x21\xf9\x04") >= 7, len(saved)
     page.keyboard.press("Space")
     expect(page.locator(".imagined")).to_have_text("0.0 s imagined")
+    page.keyboard.press("Space")
+    wait_until(lambda: imagined_s() >= 0.4, "another dream")
     page.context.close()
 
 

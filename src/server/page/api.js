@@ -104,8 +104,8 @@ async function follow(path, on, signal) {
         if (on(event.name, event.data)) return stopReading(response);
       }
     } catch (error) {
-      // Neither is worth another try: a key is missing, or there is nothing there.
-      if (error instanceof Locked || (error instanceof ApiError && error.status < 500)) return;
+      // Neither is worth another try: a key is missing, or there is nothing there. A rate limit is.
+      if (error instanceof Locked || (error instanceof ApiError && error.status < 500 && error.status !== 429)) return;
     }
     if (signal.aborted) return;
     on("lost");

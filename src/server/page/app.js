@@ -1,6 +1,6 @@
 // The page: its views, the state line, the choice of model and source, and the form for the API key.
 
-import { html, render, useEffect, useMemo, useRef, useState } from "./preact.js";
+import { html, render, useEffect, useMemo, useState } from "./preact.js";
 import { go, link, note, read } from "./address.js";
 import { unlock } from "./api.js";
 import { Data } from "./data.js";
@@ -39,7 +39,7 @@ function App() {
     <header>
       <a class="brand" href="#play" aria-label="Foreframe"><${Mark} /> Foreframe</a>
       <nav aria-label="Views">${VIEWS.map(([name, words]) => html`
-        <a href=${link(name, WITH_ROBOT[name] && WITH_ROBOT[view] ? { model: parameters.model, source: parameters.source } : {})}
+        <a href=${link(name, WITH_ROBOT[name] && WITH_ROBOT[view] ? { model: parameters.model, source: parameters.source, episode: parameters.episode } : {})}
           aria-current=${name === view ? "page" : undefined}>${words}</a>`)}</nav>
       <${StateLine} connection=${lists.connection} />
     </header>

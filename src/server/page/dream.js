@@ -38,7 +38,8 @@ class Dreaming {
     this.robot = robot;
     // What was imagined and what really came: { imagined, real, novelty, error }.
     this.moments = [];
-    robot.beside = moment => this.step(moment);
+    // The end closes the stream under a step; the robot goes on.
+    robot.beside = moment => this.step(moment).catch(error => { if (!this.is_over) throw error; });
   }
 
   nextState(state, action) {
@@ -80,21 +81,15 @@ export function Dream({ robot }) {
   useMoments(robot);
   const [dream, setDream] = useState(null);
   const why_not = whyNot(robot.model);
-  const toggle = () => {
-    dream?.end();
-    setDream(dream && !dream.is_over ? null : new Dreaming(robot));
-  };
+  const toggle = () => setDream(dream ? null : new Dreaming(robot));
   useEffect(() => () => dream?.end(), [dream]);
   // The server went away, and with it the dream's stream.
   useEffect(() => {
-    if (robot.status === "reconnecting" && dream) {
-      dream.end();
-      setDream(null);
-    }
+    if (robot.status === "reconnecting") setDream(null);
   }, [robot.status]);
   useEffect(() => {
     const pressed = event => {
-      if (event.key !== " " || event.target.closest?.("button, input, select, textarea, a") || why_not) return;
+      if (event.key !== " " || event.target.closest?.("button, input, select, textarea") || why_not) return;
       event.preventDefault();
       toggle();
     };

@@ -6,7 +6,7 @@ import { Picture } from "./picture.js";
 import { COLORS, Plot } from "./plot.js";
 import { compare, levels, lookBack } from "./score.js";
 import { Copy, curl, requests } from "./snippets.js";
-import { readEpisode, whyNotDataset } from "./sources.js";
+import { fits, readEpisode } from "./sources.js";
 import { Stream } from "./stream.js";
 
 // As many frames are read; a longer episode says so.
@@ -71,12 +71,12 @@ async function predictAll(model, { frames, actions, states }, tell, isGone) {
 
 export function Episode({ dataset, number, models, parameters }) {
   const { data, wrong } = useEpisode(dataset.name, number);
-  const fitting = models.filter(model => !whyNotDataset(model, dataset));
+  const fitting = models.filter(model => fits(model, dataset));
   // The best one, unless another or none was chosen.
   const model = parameters.model === undefined ? fitting[0] : fitting.find(({ name }) => name === parameters.model);
   const other = fitting.find(({ name }) => name === parameters.other);
   const [first, second] = [usePredictions(model, data), usePredictions(other, data)];
-  const player = usePlayer(data, dataset.frame_period_s, +(parameters.frame ?? 0));
+  const player = usePlayer(data, dataset.frame_period_s, +parameters.frame || 0);
   if (wrong) return html`<p class="wrong" role="alert">${wrong}</p>`;
   if (!data) return html`<p class="quiet wait">Reading the episode…</p>`;
   const { at } = player;
@@ -110,7 +110,7 @@ function usePlayer(data, period_s, start) {
   const [speed, setSpeed] = useState(1);
   const [is_playing, setPlaying] = useState(false);
   const count = data?.frames.length ?? 1;
-  const place = Math.min(at, count - 1);
+  const place = Math.max(0, Math.min(at, count - 1));
   useEffect(() => {
     if (!is_playing) return undefined;
     const timer = setInterval(() => document.hidden || setAt(now => (now + 1) % count), (1000 * period_s) / speed);
@@ -182,15 +182,12 @@ export function Moving({ dataset }) {
   const [turn, setTurn] = useState(0);
   const place = useRef();
   useEffect(() => {
-    let timer = null, is_gone = false;
+    let timer = null, reading = null, is_gone = false;
     // Only what is in sight is read and moves.
     const watch = new IntersectionObserver(([{ isIntersecting }]) => {
       clearInterval(timer);
       if (!isIntersecting) return;
-      setFrames(known => {
-        if (!known.length) readEpisode(dataset.name, 0, 0, CARD_FRAMES).then(read => is_gone || setFrames(read.frames), () => {});
-        return known;
-      });
+      reading ??= readEpisode(dataset.name, 0, 0, CARD_FRAMES).then(read => is_gone || setFrames(read.frames), () => { reading = null; });
       timer = setInterval(() => document.hidden || setTurn(now => now + 1), 1000 * Math.max(0.1, dataset.frame_period_s));
     });
     watch.observe(place.current);

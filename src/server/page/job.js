@@ -4,7 +4,7 @@ import { html, useEffect, useRef, useState } from "./preact.js";
 import { blob, call, get, listen, text } from "./api.js";
 
 const FINAL = ["succeeded", "failed", "cancelled"];
-export const isFinal = job => FINAL.includes(job.state);
+const isFinal = job => FINAL.includes(job.state);
 export const titleOf = ({ kind, name, model, dataset }) => `${kind} ${name ?? model}${dataset ? ` on ${dataset}` : ""}`;
 
 // Lines of a log that are kept.
@@ -18,13 +18,13 @@ export function useJob(id) {
   useEffect(() => {
     setKnown({ job: null, lines: [], losses: [] });
     if (!id) return undefined;
-    let read_ms = -Infinity;
+    let read_ms = -Infinity, is_gone = false;
     const readLosses = async () => {
       read_ms = performance.now();
       const { points } = await get(`/v1/jobs/${id}/metrics`).catch(() => ({ points: [] }));
-      setKnown(now => ({ ...now, losses: points }));
+      if (!is_gone) setKnown(now => ({ ...now, losses: points }));
     };
-    return listen(`/v1/jobs/${id}/events`, (name, data) => {
+    const stop = listen(`/v1/jobs/${id}/events`, (name, data) => {
       if (name === "log") setKnown(now => ({ ...now, lines: [...now.lines, data].slice(-MOST_LINES) }));
       if (name !== "job") return false;
       setKnown(now => ({ ...now, job: data }));
@@ -32,6 +32,10 @@ export function useJob(id) {
       if (data.spec.kind === "train" && (is_over || performance.now() - read_ms > LOSSES_EVERY_MS)) readLosses();
       return is_over;
     });
+    return () => {
+      is_gone = true;
+      stop();
+    };
   }, [id]);
   return known;
 }
@@ -66,7 +70,7 @@ export function Log({ lines }) {
 }
 
 // A picture of the server, with the key.
-export function ServerPicture({ path, alt, className = "" }) {
+function ServerPicture({ path, alt }) {
   const [url, setUrl] = useState(null);
   useEffect(() => {
     let made = null, is_gone = false;
@@ -76,7 +80,7 @@ export function ServerPicture({ path, alt, className = "" }) {
       if (made) URL.revokeObjectURL(made);
     };
   }, [path]);
-  return url ? html`<img src=${url} alt=${alt} class=${className} />` : html`<span class="quiet">${alt}…</span>`;
+  return url ? html`<img src=${url} alt=${alt} />` : html`<span class="quiet">${alt}…</span>`;
 }
 
 // An HTML page of the server inside this one: its styles apply only to it, and its scripts do not run.
@@ -126,7 +130,6 @@ function sheet(rules) {
 export function Report({ job }) {
   const files = job.result?.files ?? [];
   const path = file => `/v1/jobs/${job.id}/files/${file}`;
-  if (files.includes("report.html")) return html`<${Embedded} path=${path("report.html")} label="report" />`;
   return files.includes("report.md") ? html`<${Markdown} path=${path("report.md")} picture=${path} />` : null;
 }
 

@@ -8,7 +8,7 @@ const BUTTONS = [["ahead", "W", "▲"], ["left", "A", "◀"], ["back", "S", "▼
 const SPEED_M_S = 0.35;
 const TURN_RAD_S = 0.9;
 // After so long without a key, the robot drives itself again.
-export const PATIENCE_MS = 10_000;
+const PATIENCE_MS = 10_000;
 
 const held = new Set();
 const listeners = new Set();

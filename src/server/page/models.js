@@ -4,7 +4,7 @@ import { html, useState } from "./preact.js";
 import { link } from "./address.js";
 import { call } from "./api.js";
 import { readModels } from "./server_lists.js";
-import { whyNotDataset } from "./sources.js";
+import { fits } from "./sources.js";
 
 export function Models({ models, datasets }) {
   const [wrong, setWrong] = useState("");
@@ -23,7 +23,7 @@ export function Models({ models, datasets }) {
 function Compare({ pair, datasets }) {
   if (pair.length < 2) return html`<p class="quiet">Mark two models to compare them on one episode.</p>`;
   const [one, other] = pair;
-  const shared = (datasets ?? []).find(dataset => !whyNotDataset(one, dataset) && !whyNotDataset(other, dataset));
+  const shared = (datasets ?? []).find(dataset => fits(one, dataset) && fits(other, dataset));
   return shared ? html`<p><a href=${link("data", { set: shared.name, episode: 0, model: one.name, other: other.name })}>Compare ${one.name} and ${other.name} on ${shared.name}</a></p>`
     : html`<p class="quiet">No data set here fits both ${one.name} and ${other.name}. Collect one with their scenario.</p>`;
 }
@@ -34,7 +34,7 @@ function Card({ model, act, is_marked, mark }) {
   const { name, spec, metrics, lineage, versions, active_version } = model;
   const { skill, skill_interval_95: interval, strongest_baseline } = metrics.test ?? {};
   const facts = [["inputs", INPUTS[spec.conditioning]], ["frames", `${spec.frame_width_px}×${spec.frame_height_px} px, ${spec.frame_period_s} s`],
-    ["predicts", `${spec.horizon} from ${spec.context}`], ["parameters", lineage.parameters.toLocaleString("en")], ["trained on", lineage.dataset]];
+    ["predicts", `${spec.horizon} frames from ${spec.context}`], ["parameters", lineage.parameters.toLocaleString("en")], ["trained on", lineage.dataset]];
   return html`<article class=${`card ${is_marked ? "chosen" : ""}`}>
     <h3>${name}</h3>
     <${Skill} skill=${skill} interval=${interval} baseline=${strongest_baseline} />

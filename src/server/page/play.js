@@ -6,7 +6,7 @@ import { Mixed, Picture } from "./picture.js";
 import { Plot } from "./plot.js";
 import { contextBody } from "./predict.js";
 import { useMoments } from "./robot.js";
-import { levels, NOVEL, novelty, noveltyClass, noveltyWord, share } from "./score.js";
+import { AVERAGED, levels, NOVEL, novelty, noveltyClass, noveltyWord, share } from "./score.js";
 import { takesActions } from "./server_lists.js";
 import { Copy, curl, requests, streamInPython } from "./snippets.js";
 
@@ -85,7 +85,7 @@ function Verdict({ robot, score }) {
     : `Error ${percent < 1000 ? percent.toFixed(0) : ">999"} % of the best simple guess`;
   const warnings = robot.history.at(-1)?.prediction?.warnings ?? [];
   return html`<div class=${`verdict ${is_unlike ? "bad" : ""}`}>
-    <p class="line"><b title="The better of two guesses that need no model: the frame of then, and the mean of its context. Over the last 3 s.">${words}</b>
+    <p class="line"><b title=${`The better of two guesses that need no model: the last frame of the context, and the mean of the context. Over the last ${AVERAGED} frames.`}>${words}</b>
       ${novel !== null && html`<span>; novelty <b class=${noveltyClass(novel)}>${noveltyWord(novel)}</b></span>`}</p>
     <div class="bar" role="img" aria-label=${percent === null ? "no error yet" : `error ${percent.toFixed(0)} percent of the best simple guess`}>
       <span class=${percent === null ? "" : percent < 100 ? "good" : "bad"} style=${{ width: `${Math.min(100, (percent ?? 0) / 2)}%` }} />

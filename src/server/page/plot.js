@@ -19,15 +19,16 @@ function drawMark(chart, x) {
   context.fillRect(left - 1, top, 2 * devicePixelRatio, height);
 }
 
-// series: [{ label, color, dash, fill }]; data: the x values, then those of each series. `sync` names charts that share a cursor.
+// series: [{ label, color, dash, width, points }]; data: the x values, then those of each series.
+// `sync` names charts that share a cursor.
 export function Plot({ label, data, series, height = 150, x = "", y = "", log, sync, bands, range, onPick, mark, legend = false }) {
   const place = useRef(), plot = useRef(), pick = useRef(), marked = useRef();
   pick.current = onPick;
   marked.current = mark;
   const kind = JSON.stringify([series, log, bands, sync, x, y]);
   useLayoutEffect(() => {
-    const line = ({ label: name, color: shade, dash, width = 1.5, fill, points = false }) => ({
-      label: name, stroke: () => color(shade), dash, width, fill: fill && (() => `${color(shade)}33`), points: { show: points }, spanGaps: true,
+    const line = ({ label: name, color: shade, dash, width = 1.5, points = false }) => ({
+      label: name, stroke: () => color(shade), dash, width, points: { show: points }, spanGaps: true,
     });
     const made = new uPlot({
       width: place.current.clientWidth || 300, height, legend: { show: legend, live: false },
@@ -38,7 +39,10 @@ export function Plot({ label, data, series, height = 150, x = "", y = "", log, s
       hooks: { draw: [chart => drawMark(chart, marked.current)] },
     }, data, place.current);
     plot.current = made;
-    made.over.addEventListener("click", () => pick.current?.(made.data[0][made.cursor.idx]));
+    made.over.addEventListener("click", () => {
+      const x = made.data[0][made.cursor.idx];
+      if (x !== undefined) pick.current?.(x);
+    });
     const resized = new ResizeObserver(() => made.setSize({ width: place.current.clientWidth, height }));
     resized.observe(place.current);
     const dark = matchMedia("(prefers-color-scheme: dark)");

@@ -1,8 +1,7 @@
 // A robot and a model that predicts its frames: the loop that Play, Dream and What if share.
 
 import { useEffect, useState } from "./preact.js";
-import { isLocked } from "./server_lists.js";
-import { pause } from "./api.js";
+import { Locked, pause } from "./api.js";
 import { heldAction, isManual } from "./keys.js";
 import { predictLast } from "./predict.js";
 import { compare, lookBack } from "./score.js";
@@ -21,7 +20,6 @@ export class Robot {
     // starting, collecting, running or reconnecting.
     this.status = "starting";
     this.have = 0;
-    this.error = "";
     this.speed = 1;
     // While true, the robot stands; What if shows what it could do.
     this.is_held = false;
@@ -69,14 +67,15 @@ export class Robot {
     for (let wait_ms = FIRST_WAIT_MS; !this.is_closed; wait_ms = Math.min(1.5 * wait_ms, LONGEST_WAIT_MS)) {
       try {
         await this.connect();
-        wait_ms = FIRST_WAIT_MS;
-        while (!this.is_closed) await this.tick();
+        while (!this.is_closed) {
+          await this.tick();
+          wait_ms = FIRST_WAIT_MS;
+        }
         this.disconnect();
       } catch (error) {
         this.disconnect();
-        if (this.is_closed || isLocked(error)) return;
+        if (this.is_closed || error instanceof Locked) return;
         this.status = "reconnecting";
-        this.error = error.message;
         this.tell();
         await pause(wait_ms);
       }
@@ -131,7 +130,6 @@ export class Robot {
     this.history.push(moment);
     this.status = answer.type === "prediction" ? "running" : "collecting";
     this.have = answer.have ?? this.spec.context;
-    this.error = "";
     const kept = Math.ceil(HISTORY_S / this.spec.frame_period_s) + this.spec.horizon + this.spec.context;
     if (this.history.length > kept) this.history.shift();
   }

@@ -5,10 +5,10 @@ import { mean, mse } from "./gray.js";
 // Below this, nothing moves and the camera's noise decides: 1.5 gray levels.
 const STILL_MSE = (1.5 / 255) ** 2;
 // Moments over which errors are averaged: single frames jump.
-const AVERAGED = 15;
-// Above it, a prediction is not to be trusted; above the lower one, take care.
+export const AVERAGED = 15;
+// Above NOVEL, a prediction is not to be trusted; above RAISED, take care.
 export const NOVEL = 0.99;
-export const RAISED = 0.9;
+const RAISED = 0.9;
 
 export const levels = error => 255 * Math.sqrt(error);
 

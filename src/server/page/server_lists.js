@@ -1,10 +1,10 @@
 // What the server has: models, data sets and jobs. Its events say when to read a list again.
 
 import { useEffect, useState } from "./preact.js";
-import { ApiError, all, get, listen, Locked, onLocked } from "./api.js";
+import { ApiError, all, get, listen, onLocked } from "./api.js";
 
 // connection: connecting, connected, reconnecting, stopping or locked. A list is null until it is known.
-export let lists = { connection: "connecting", locked: null, models: null, notice: null, datasets: null, jobs: null, may_use_jobs: true };
+let lists = { connection: "connecting", locked: null, models: null, notice: null, datasets: null, jobs: null, may_use_jobs: true };
 const listeners = new Set();
 
 function change(changes) {
@@ -33,7 +33,7 @@ export async function readModels() {
   change({ models: models.sort(bySkill), notice: notice ?? null });
 }
 
-export async function readJobs() {
+async function readJobs() {
   try {
     const [{ jobs }, { datasets }] = await Promise.all([get("/v1/jobs?limit=100"), all("/v1/datasets", "datasets")]);
     change({ jobs, datasets, may_use_jobs: true });
@@ -65,4 +65,3 @@ onLocked(why => {
   stop();
   change({ connection: "locked", locked: why });
 });
-export const isLocked = error => error instanceof Locked;

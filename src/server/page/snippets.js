@@ -11,7 +11,9 @@ export function curl(method, path, body, options = "") {
   return `curl -s${method === "GET" || body !== undefined ? "" : ` -X ${method}`} ${location.origin}${path}${header()}${options}${data}`;
 }
 
-const python = value => JSON.stringify(value).replaceAll("true", "True").replaceAll("false", "False").replaceAll("null", "None");
+// JSON's literals in Python; a string that contains one stays.
+const LITERALS = { true: "True", false: "False", null: "None" };
+const python = value => JSON.stringify(value).replaceAll(/"(?:[^"\\]|\\.)*"|true|false|null/g, part => LITERALS[part] ?? part);
 
 export function requests(method, path, body, rest = "print(answer.json())") {
   const given = [hasKey() && 'headers={"Authorization": "Bearer KEY"}', body !== undefined && `json=${python(body)}`].filter(Boolean);

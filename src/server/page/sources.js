@@ -13,35 +13,26 @@ const names = channels => channels.map(({ name }) => name);
 const areEqual = (one, other) => one.length === other.length && one.every((name, index) => name === other[index]);
 const isNear = (one, other) => Math.abs(one - other) <= 0.01 * Math.abs(other);
 
-// Why the simulator does not fit a model; an empty text if it does.
-export function whyNotSimulator({ spec, lineage }) {
-  if (!lineage.scenario) return "it was trained on recordings, not on the simulator";
-  if (takesActions({ spec }) && !areEqual(names(spec.actions), SIMULATOR_ACTIONS)) return "it takes other actions";
-  if (takesState({ spec }) && !areEqual(names(spec.states), SIMULATOR_STATES)) return "it takes another state";
-  return "";
-}
+const fitsSimulator = model => Boolean(model.lineage.scenario)
+  && (!takesActions(model) || areEqual(names(model.spec.actions), SIMULATOR_ACTIONS))
+  && (!takesState(model) || areEqual(names(model.spec.states), SIMULATOR_STATES));
 
-// Why a data set does not fit a model; an empty text if it does.
-export function whyNotDataset(model, dataset) {
+// Whether a model can predict a data set: frame size and rate, channels, camera, and simulated or recorded have to match.
+export function fits(model, dataset) {
   const { spec, lineage } = model;
-  const size = of => `${of.frame_width_px}×${of.frame_height_px} px`;
-  if (size(spec) !== size(dataset)) return `its frames are ${size(dataset)}; the model takes ${size(spec)}`;
-  if (!isNear(dataset.frame_period_s, spec.frame_period_s)) {
-    return `its frames are ${dataset.frame_period_s} s apart; the model takes ${spec.frame_period_s} s`;
-  }
-  if (takesActions(model) && !areEqual(names(spec.actions), names(dataset.actions))) return "it has other actions";
-  if (takesState(model) && !areEqual(names(spec.states), names(dataset.states))) return "it has another state";
-  if (Boolean(lineage.scenario) !== Boolean(dataset.scenario)) {
-    return dataset.scenario ? "it is simulated; the model was trained on recordings" : "it is recorded; the model was trained in the simulator";
-  }
-  if (spec.camera && dataset.camera && !isNear(dataset.camera.horizontal_fov_rad, spec.camera.horizontal_fov_rad)) return "it has another camera";
-  return "";
+  const have_cameras = spec.camera && dataset.camera;
+  return spec.frame_width_px === dataset.frame_width_px && spec.frame_height_px === dataset.frame_height_px
+    && isNear(dataset.frame_period_s, spec.frame_period_s)
+    && (!takesActions(model) || areEqual(names(spec.actions), names(dataset.actions)))
+    && (!takesState(model) || areEqual(names(spec.states), names(dataset.states)))
+    && Boolean(lineage.scenario) === Boolean(dataset.scenario)
+    && (!have_cameras || isNear(dataset.camera.horizontal_fov_rad, spec.camera.horizontal_fov_rad));
 }
 
 // The sources that a model can be offered: { id, label }.
 export function sourcesOf(model, datasets) {
-  const simulator = whyNotSimulator(model) ? [] : [{ id: "simulator", label: "simulator" }];
-  const fitting = (datasets ?? []).filter(dataset => !whyNotDataset(model, dataset));
+  const simulator = fitsSimulator(model) ? [{ id: "simulator", label: "simulator" }] : [];
+  const fitting = (datasets ?? []).filter(dataset => fits(model, dataset));
   return [...simulator, ...fitting.map(({ name }) => ({ id: `set:${name}`, label: `recorded: ${name}` }))];
 }
 
@@ -51,7 +42,7 @@ export function openSource(model, id, episode) {
 
 // A simulated robot on the server. A moment is what is known at a frame: the frame, the state, the driver's next action, the true
 // poses, and whether an episode begins.
-export class Simulator {
+class Simulator {
   static async open(model) {
     const { frame_period_s, frame_width_px, frame_height_px, camera } = model.spec;
     const scenario = model.lineage.scenario;
@@ -94,13 +85,13 @@ const EPISODE_FRAMES = 300;
 export async function readEpisode(dataset, episode, from = 0, limit = EPISODE_FRAMES) {
   const read = await get(`/v1/datasets/${dataset}/episodes/${episode}?from=${from}&limit=${limit}`);
   const frames = [];
-  // One after another: they are decoded on one canvas.
+  // One after another, so that memory does not hold all decoded bitmaps at once.
   for (const frame of read.frames) frames.push(await fromPng(frame));
   return { ...read, frames };
 }
 
 // A recorded episode, over and over. It cannot be driven: its actions are recorded too.
-export class Recording {
+class Recording {
   static async open(dataset, episode = 0) {
     return new Recording(await readEpisode(dataset, episode));
   }

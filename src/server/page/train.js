@@ -51,7 +51,8 @@ function settingsOf(lines, steps) {
     const [key, value] = (line || "").split(/=(.*)/s).map(part => part.trim());
     if (!key || value === undefined) continue;
     const parts = key.split("."), last = parts.pop();
-    const place = parts.reduce((within, part) => (within[part] ??= {}), settings);
+    // A value that an earlier line gave to a group stays, and the server refuses it.
+    const place = parts.reduce((within, part) => (within[part] = Object(within[part] ?? {})), settings);
     try {
       place[last] = JSON.parse(value);
     } catch {

@@ -35,8 +35,8 @@ const path = robot => `/v1/models/${robot.model.name}/rollouts`;
 async function compareAll(robot, context) {
   const request = requestFor(robot, context);
   const answer = await call("POST", path(robot), request);
-  return PLANS.map(([name, ahead, left, color], place) => ({
-    name, ahead, left, color, actions: request.plans[place],
+  return PLANS.map(([name, , , color], place) => ({
+    name, color, actions: request.plans[place],
     frames: decode(answer.rollouts[place], robot.spec),
     expected: answer.expected_mse?.[place]?.at(-1),
   }));
@@ -58,9 +58,11 @@ export function WhatIf({ robot }) {
   }, [robot]);
   useEffect(() => {
     const context = takesActions(robot.model) && present(robot);
-    if (!context) return;
+    if (!context) return undefined;
+    let is_gone = false;
     setGoal(known => known ?? context.at(-1).frame);
-    compareAll(robot, context).then(made => { setPlans(made); setWrong(""); }, error => setWrong(error.message));
+    compareAll(robot, context).then(made => { if (!is_gone) { setPlans(made); setWrong(""); } }, error => is_gone || setWrong(error.message));
+    return () => { is_gone = true; };
   }, [robot, robot.now, robot.status, robot.plan.length]);
   const costs = plans.map(({ frames }) => (goal ? mse(frames.at(-1), goal) : 0));
   const best = costs.indexOf(Math.min(...costs));
@@ -92,7 +94,7 @@ export function WhatIf({ robot }) {
     <p class="wrong" role="alert">${wrong}</p>
     <h2>What the next ${(robot.spec.horizon * robot.spec.frame_period_s).toFixed(1)} s would look like</h2>
     <p class="quiet">The cost is the difference between the last predicted frame and the goal, in gray levels, ± the error to expect. The cheapest plan is outlined. Click one, and the robot takes it.</p>
-    <div class=${`plans ${is_moving ? "dim" : ""}`}>${(plans.length ? plans : PLANS.map(([name, , , color]) => ({ name, color, frames: [] }))).map((plan, place) => html`
+    <div class="plans">${(plans.length ? plans : PLANS.map(([name, , , color]) => ({ name, color, frames: [] }))).map((plan, place) => html`
       <button class=${`plan ${place === best && plans.length ? "best" : ""}`} disabled=${!plans.length || is_moving || !robot.is_drivable} onClick=${() => take(plan)}>
         <h3><i style=${{ background: `var(${plan.color})` }} />${plan.name}</h3>
         <${Picture} image=${plan.frames[step] ?? frame} label=${`predicted for ${plan.name}`} note=${plans.length ? "" : note} />
