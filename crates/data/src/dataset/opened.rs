@@ -8,7 +8,7 @@ use sha2::{Digest, Sha256};
 use super::check::{check_description, check_episode};
 use super::frame_store::frame_file::FrameFile;
 use super::frame_store::{FrameContent, FrameStore};
-use super::{DatasetError, DatasetInfo, Episode, EpisodeData, Window};
+use super::{DatasetError, DatasetInfo, Episode, EpisodeData};
 use foreframe_core::frame::Frame;
 use foreframe_core::frame::warp::CameraModel;
 use foreframe_sim::CameraConfig;
@@ -136,9 +136,9 @@ impl Dataset {
         simulated.map(CameraConfig::model_with_height).or(self.info.camera)
     }
 
-    /// The camera of each window; empty unless all are known.
-    pub fn cameras<'a>(&self, windows: impl IntoIterator<Item = &'a Window>) -> Vec<CameraModel> {
-        let cameras = windows.into_iter().map(|window| self.camera(window.episode));
+    /// The camera of each of the episodes, given by position; empty unless all are known.
+    pub fn cameras(&self, episodes: impl IntoIterator<Item = usize>) -> Vec<CameraModel> {
+        let cameras = episodes.into_iter().map(|episode| self.camera(episode));
         cameras.collect::<Option<_>>().unwrap_or_default()
     }
 

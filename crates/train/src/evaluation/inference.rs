@@ -168,7 +168,7 @@ impl<'a> Inference<'a> {
             let earlier = earlier.map(|frame| dataset.state(frame)).collect::<Vec<_>>().concat();
             condition.past_states = Some(Tensor::from_vec(earlier, (batch, last, count), &Device::Cpu)?);
         }
-        condition.cameras = dataset.cameras(windows);
+        condition.cameras = dataset.cameras(windows.iter().map(|window| window.episode));
         Ok(condition)
     }
 }

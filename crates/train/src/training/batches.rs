@@ -151,7 +151,7 @@ impl<'a> FrameSource<'a> {
                 actions: self.channels(ACTION, &acting, &[windows.len(), horizon])?,
                 state: self.channels(STATE, &last, &[windows.len()])?,
                 past_states: self.channels(STATE, &earlier, &[windows.len(), context - 1])?,
-                cameras: self.dataset.cameras(windows.iter().map(|drawn| drawn.window)),
+                cameras: self.dataset.cameras(windows.iter().map(|drawn| drawn.window.episode)),
             },
             future_states: self.channels(STATE, &future, &[windows.len(), horizon])?,
         })
