@@ -52,14 +52,14 @@ impl NearestWindows {
             exponent: 1.0,
             action_weight: 0.0,
         };
-        let mut least = f64::INFINITY;
-        let weights = if windows.has_actions() {
+        let action_weights = if windows.has_actions() {
             &ACTION_WEIGHTS[..]
         } else {
             &[0.0]
         };
-        for &action_weight in weights {
-            let errors = validation_errors(dataset, &windows, &validation, action_weight)?;
+        let errors = validation_errors(dataset, &windows, &validation, action_weights)?;
+        let mut least = f64::INFINITY;
+        for (&action_weight, errors) in action_weights.iter().zip(errors) {
             for (exponent, error) in EXPONENTS.into_iter().zip(errors) {
                 // Without a validation window no error is known.
                 if error < least && !validation.is_empty() {
@@ -83,7 +83,9 @@ impl NearestWindows {
         input: &BaselineInput,
         horizon: usize,
     ) -> Result<Vec<Vec<f32>>, EvaluationError> {
-        let neighbours = self.windows.nearest(dataset, input, self.summary.action_weight)?;
+        let mut distances = self.windows.pixel_distances(input);
+        let weight = self.summary.action_weight;
+        let neighbours = self.windows.nearest(dataset, &mut distances, &input.actions, weight)?;
         let weights = weights(&neighbours, self.summary.exponent);
         let first = input.inputs.len();
         let steps = (first..first + horizon).map(|step| Ok(mean(&frames_at(dataset, &neighbours, step)?, &weights)));
@@ -91,36 +93,38 @@ impl NearestWindows {
     }
 }
 
-/// The sum of the MSE over validation windows and steps for each of [`EXPONENTS`]. Errors: those of [`Dataset::pixels`].
+/// The sum of the MSE over validation windows and steps, for each weight of the actions and each of [`EXPONENTS`]. Errors:
+/// those of [`Dataset::pixels`].
 fn validation_errors(
     dataset: &Dataset,
     windows: &TrainingWindows,
     validation: &[Window],
-    action_weight: f64,
-) -> Result<Vec<f64>, EvaluationError> {
+    action_weights: &[f64],
+) -> Result<Vec<[f64; EXPONENTS.len()]>, EvaluationError> {
     let shape = windows.shape();
-    let errors_of = |&window: &Window| -> Result<Vec<f64>, EvaluationError> {
+    let errors_of = |&window: &Window| -> Result<Vec<[f64; EXPONENTS.len()]>, EvaluationError> {
         let inputs = (0..shape.context).map(|step| true_frame(dataset, window.first_frame + step));
         let inputs = inputs.collect::<Result<Vec<_>, _>>()?;
         let input = BaselineInput::of_window(dataset, window, shape, &inputs);
-        let neighbours = windows.nearest(dataset, &input, action_weight)?;
-        let mut errors = vec![0.0; EXPONENTS.len()];
-        for step in shape.context..shape.frames() {
-            let (frames, truth) = (
-                frames_at(dataset, &neighbours, step)?,
-                true_frame(dataset, window.first_frame + step)?,
-            );
-            for (error, exponent) in errors.iter_mut().zip(EXPONENTS) {
-                *error += mse(&mean(&frames, &weights(&neighbours, exponent)), &truth);
+        let mut distances = windows.pixel_distances(&input);
+        let mut by_weight = vec![[0.0; EXPONENTS.len()]; action_weights.len()];
+        for (errors, &action_weight) in by_weight.iter_mut().zip(action_weights) {
+            let neighbours = windows.nearest(dataset, &mut distances, &input.actions, action_weight)?;
+            for step in shape.context..shape.frames() {
+                let frames = frames_at(dataset, &neighbours, step)?;
+                let truth = true_frame(dataset, window.first_frame + step)?;
+                for (error, exponent) in errors.iter_mut().zip(EXPONENTS) {
+                    *error += mse(&mean(&frames, &weights(&neighbours, exponent)), &truth);
+                }
             }
         }
-        Ok(errors)
+        Ok(by_weight)
     };
     let by_window = validation.par_iter().map(errors_of).collect::<Result<Vec<_>, _>>()?;
     // Added in one order, so that the same weights are chosen in every run.
-    let mut sums = vec![0.0; EXPONENTS.len()];
+    let mut sums = vec![[0.0; EXPONENTS.len()]; action_weights.len()];
     for errors in by_window {
-        for (sum, error) in sums.iter_mut().zip(errors) {
+        for (sum, error) in sums.as_flattened_mut().iter_mut().zip(errors.as_flattened()) {
             *sum += error;
         }
     }
@@ -216,6 +220,16 @@ mod tests {
         frames.sum()
     }
 
+    /// The neighbours, whatever the actions.
+    fn nearest(search: &TrainingWindows, dataset: &Dataset, input: &BaselineInput) -> Vec<Neighbour> {
+        let mut distances = search.pixel_distances(input);
+        // A second search finds the same, though it compares fewer pixels.
+        let first = search.nearest(dataset, &mut distances, &input.actions, 0.0).unwrap();
+        let second = search.nearest(dataset, &mut distances, &input.actions, 0.0).unwrap();
+        assert_eq!(first, second);
+        first
+    }
+
     #[test]
     fn the_neighbours_are_exactly_those_of_a_full_search() {
         let frames = noise(400);
@@ -227,7 +241,7 @@ mod tests {
         for &window in others.iter().step_by(9) {
             let inputs = inputs(&dataset, window);
             let input = BaselineInput::of_window(&dataset, window, SHAPE, &inputs);
-            let found = search.nearest(&dataset, &input, 0.0).unwrap();
+            let found = nearest(&search, &dataset, &input);
             let mut expected: Vec<Neighbour> = training
                 .iter()
                 .map(|&near| Neighbour {
@@ -249,7 +263,7 @@ mod tests {
         for window in spread {
             let inputs = inputs(&dataset, window);
             let input = BaselineInput::of_window(&dataset, window, SHAPE, &inputs);
-            let found = search.nearest(&dataset, &input, 0.0).unwrap();
+            let found = nearest(&search, &dataset, &input);
             assert_eq!((found[0].window, found[0].distance), (window, 0.0));
         }
     }

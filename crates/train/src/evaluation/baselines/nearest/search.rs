@@ -22,7 +22,7 @@ pub(super) struct Neighbour {
     pub(super) distance: f64,
 }
 
-/// A training window that may be near: no pixels were compared yet.
+/// A training window that may be near.
 #[derive(Clone, Copy)]
 struct CandidateWindow {
     place: usize,
@@ -30,6 +30,22 @@ struct CandidateWindow {
     bound: f64,
     /// The actions' part of it.
     of_actions: f64,
+}
+
+/// What is known of the pixels' part of one window's distance.
+#[derive(Clone, Copy)]
+struct PixelDistance {
+    /// Input frames that were compared pixel by pixel.
+    compared_frames: usize,
+    /// Their squared difference; before the first, what the small images say. The whole distance is not less.
+    squared: f64,
+}
+
+/// The pixels of one window's inputs and what is known of their distances to all training windows. Searches with different
+/// weights of the actions share it.
+pub(super) struct PixelDistances {
+    pixels: Vec<Vec<u8>>,
+    by_place: Vec<PixelDistance>,
 }
 
 /// Training windows, with small images of their inputs.
@@ -105,25 +121,45 @@ impl TrainingWindows {
         self.action_precision.iter().any(|&precision| precision > 0.0)
     }
 
+    /// What the small images say of the distances of inputs, before any search.
+    pub(super) fn pixel_distances(&self, input: &BaselineInput) -> PixelDistances {
+        let bytes = |frame: &Vec<f32>| frame.iter().map(|value| (value * 255.0).round() as u8).collect();
+        let pixels: Vec<Vec<u8>> = input.inputs.iter().map(bytes).collect();
+        let values = self.images.values();
+        let mut wanted = vec![0.0; pixels.len() * values];
+        for (small, frame) in wanted.chunks_exact_mut(values).zip(&pixels) {
+            self.images.shrink(frame, small);
+        }
+        let distance = |&first: &usize| {
+            let small = &self.small[first..first + wanted.len()];
+            PixelDistance {
+                compared_frames: 0,
+                // A little room for rounding.
+                squared: (0.999 * f64::from(squared_distance(small, &wanted)) - 1.0).max(0.0),
+            }
+        };
+        let by_place = self.first_small.iter().map(distance).collect();
+        PixelDistances { pixels, by_place }
+    }
+
     /// The [`NEIGHBOURS`] windows of least distance, the nearest first. They are exactly those: a window is left out only
     /// where its small images are farther than the last of them. Errors: those of [`Dataset::pixels`].
     pub(super) fn nearest(
         &self,
         dataset: &Dataset,
-        input: &BaselineInput,
+        distances: &mut PixelDistances,
+        actions: &[&[f32]],
         action_weight: f64,
     ) -> Result<Vec<Neighbour>, EvaluationError> {
-        let bytes = |frame: &Vec<f32>| frame.iter().map(|value| (value * 255.0).round() as u8).collect();
-        let pixels: Vec<Vec<u8>> = input.inputs.iter().map(bytes).collect();
-        let mut candidates = self.candidates(dataset, &pixels, &input.actions, action_weight);
+        let mut candidates = self.candidates(dataset, distances, actions, action_weight);
         let mut nearest = Vec::with_capacity(NEIGHBOURS + 1);
         let first = FIRST_CANDIDATES.min(candidates.len());
         candidates.select_nth_unstable_by(first - 1, |one, other| one.bound.total_cmp(&other.bound));
         let rest = candidates.split_off(first);
-        self.compare(dataset, &pixels, candidates, &mut nearest)?;
+        self.compare(dataset, distances, candidates, &mut nearest)?;
         let limit = limit(&nearest);
         let rest = rest.into_iter().filter(|candidate| candidate.bound <= limit).collect();
-        self.compare(dataset, &pixels, rest, &mut nearest)?;
+        self.compare(dataset, distances, rest, &mut nearest)?;
         Ok(nearest)
     }
 
@@ -131,32 +167,24 @@ impl TrainingWindows {
     fn candidates(
         &self,
         dataset: &Dataset,
-        pixels: &[Vec<u8>],
+        distances: &PixelDistances,
         actions: &[&[f32]],
         action_weight: f64,
     ) -> Vec<CandidateWindow> {
-        let values = self.images.values();
-        let mut wanted = vec![0.0; pixels.len() * values];
-        for (small, frame) in wanted.chunks_exact_mut(values).zip(pixels) {
-            self.images.shrink(frame, small);
-        }
         let scale = action_weight * self.action_unit;
-        let candidate = |(place, &first): (usize, &usize)| {
-            let small = &self.small[first..first + wanted.len()];
+        let candidate = |(place, pixels): (usize, &PixelDistance)| {
             let of_actions = if scale > 0.0 {
                 scale * self.action_distance(dataset, self.windows[place], actions)
             } else {
                 0.0
             };
-            // A little room for rounding.
-            let of_images = (0.999 * f64::from(squared_distance(small, &wanted)) - 1.0).max(0.0);
             CandidateWindow {
                 place,
-                bound: of_images + of_actions,
+                bound: pixels.squared + of_actions,
                 of_actions,
             }
         };
-        self.first_small.iter().enumerate().map(candidate).collect()
+        distances.by_place.iter().enumerate().map(candidate).collect()
     }
 
     /// The squared distance between the actions to come, each channel in its standard deviations.
@@ -175,7 +203,7 @@ impl TrainingWindows {
     fn compare(
         &self,
         dataset: &Dataset,
-        pixels: &[Vec<u8>],
+        distances: &mut PixelDistances,
         mut candidates: Vec<CandidateWindow>,
         nearest: &mut Vec<Neighbour>,
     ) -> Result<(), EvaluationError> {
@@ -186,13 +214,19 @@ impl TrainingWindows {
                 break;
             }
             let window = self.windows[candidate.place];
-            let mut distance = candidate.of_actions;
-            for (pixels, frame) in pixels.iter().zip(window.first_frame..) {
-                distance += squared_byte_distance(pixels, &dataset.pixels(frame)?) as f64;
-                if distance > limit {
+            let known = &mut distances.by_place[candidate.place];
+            let frames = distances.pixels.iter().zip(window.first_frame..);
+            for (pixels, frame) in frames.skip(known.compared_frames) {
+                if known.compared_frames == 0 {
+                    known.squared = 0.0;
+                }
+                known.squared += squared_byte_distance(pixels, &dataset.pixels(frame)?) as f64;
+                known.compared_frames += 1;
+                if known.squared + candidate.of_actions > limit {
                     break;
                 }
             }
+            let distance = known.squared + candidate.of_actions;
             let place = nearest
                 .partition_point(|other| (other.distance, other.window.first_frame) < (distance, window.first_frame));
             nearest.insert(place, Neighbour { window, distance });
