@@ -39,7 +39,8 @@ class Dreaming {
     // What was imagined and what really came: { imagined, real, novelty, error }.
     this.moments = [];
     // The end closes the stream under a step; the robot goes on.
-    robot.beside = moment => this.step(moment).catch(error => { if (!this.is_over) throw error; });
+    this.follow = moment => this.step(moment).catch(error => { if (!this.is_over) throw error; });
+    robot.beside = this.follow;
   }
 
   nextState(state, action) {
@@ -50,6 +51,7 @@ class Dreaming {
   async fallAsleep() {
     const { context, model } = this.robot;
     this.stream = await Stream.open(model.name);
+    if (this.is_over) return this.stream.close();
     const answer = await sendAll(this.stream, context);
     const last = context.at(-1);
     [this.frame, this.novelty, this.state] = [answer.frames[0], answer.novelty, this.nextState(last.state, last.action)];
@@ -59,6 +61,7 @@ class Dreaming {
     if (this.is_over || this.moments.length >= MOST_FRAMES) return;
     if (!this.stream && this.robot.context.length < this.robot.spec.context) return;
     if (!this.stream) await this.fallAsleep();
+    if (this.is_over) return;
     const { spec, is_drivable } = this.robot;
     // A recording does not follow the keys, and a new episode has nothing to do with the dream.
     const is_manual = isManual();
@@ -72,7 +75,8 @@ class Dreaming {
 
   end() {
     this.is_over = true;
-    this.robot.beside = async () => {};
+    // A next dream may have begun before this end: effects run after the picture is drawn.
+    if (this.robot.beside === this.follow) this.robot.beside = async () => {};
     this.stream?.close();
   }
 }
@@ -81,7 +85,8 @@ export function Dream({ robot }) {
   useMoments(robot);
   const [dream, setDream] = useState(null);
   const why_not = whyNot(robot.model);
-  const toggle = () => setDream(dream ? null : new Dreaming(robot));
+  // Of the state that is, not of the one drawn last: two presses may come between two pictures.
+  const toggle = () => setDream(present => (present ? null : new Dreaming(robot)));
   useEffect(() => () => dream?.end(), [dream]);
   // The server went away, and with it the dream's stream.
   useEffect(() => {
