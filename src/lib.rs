@@ -46,7 +46,7 @@ pub use foreframe_core::nn::{
 pub use foreframe_core::registry::calibration::{
     Calibration, ContextStatistics, ExpectedError, NoveltyScale, StepErrors, ValueRange,
 };
-pub use foreframe_core::registry::{DatasetStamp, Manifest, Model, ProgramStamp, RegistryError, load};
+pub use foreframe_core::registry::{DatasetShare, DatasetStamp, Manifest, Model, ProgramStamp, RegistryError, load};
 pub use foreframe_core::serving::session::{SessionSnapshot, SnapshotError};
 pub use foreframe_core::serving::{
     InputError, Prediction, PredictionInput, Predictor, PredictorConfig, Rollout, ServingError, Session, Timing,
@@ -82,8 +82,8 @@ pub mod dataset {
         ImportConfig, ImportError, ImportOptions, ImportProgress, Imported, SkippedItem, import,
     };
     pub use foreframe_data::dataset::{
-        CollectConfig, CollectProgress, Dataset, DatasetError, DatasetInfo, Episode, EpisodeData, Split, Splits,
-        Window, WindowShape, collect,
+        CollectConfig, CollectProgress, Dataset, DatasetError, DatasetInfo, DatasetPart, Episode, EpisodeData, Split,
+        Splits, Window, WindowShape, collect,
     };
     pub use foreframe_data::inspection::{
         ActionDelay, ChannelRole, ChannelSummary, ExposureJump, FramePlace, FrameTiming, FrozenSpan, Histogram,

@@ -1,6 +1,7 @@
 //! `foreframe train`
 
 use std::path::PathBuf;
+use std::str::FromStr;
 
 use super::error::CliError;
 use super::interrupt;
@@ -9,6 +10,7 @@ use super::progress::ProgressLine;
 use super::settings::DirectoryArgs;
 use super::workspace::Workspace;
 use foreframe_core::registry::StoredWeights;
+use foreframe_data::dataset::Dataset;
 use foreframe_train::evaluation;
 use foreframe_train::settings::SettingsLayer;
 use foreframe_train::training::{self, TrainConfig, Training, TrainingEvent, TrainingOutcome, TrainingStage};
@@ -24,7 +26,8 @@ use foreframe_train::training::{self, TrainConfig, Training, TrainingEvent, Trai
   foreframe train --preset moving --set seed=2 --set sequence.steps=4000 --out runs/moving-2
   foreframe train --preset paper --print-config > mine.toml
   foreframe train --preset paper --config mine.toml
-  foreframe train --from moving-flow --dataset mine --set name=mine --set sequence.steps=300")]
+  foreframe train --from moving-flow --dataset mine --set name=mine --set sequence.steps=300
+  foreframe train --preset rooms --dataset rooms-a --dataset rooms-b=0.3 --out runs/rooms")]
 pub(super) struct TrainArgs {
     /// paper (dense network, 1000 windows), static (dense, all windows), moving (dense, with state and actions), static-flow,
     /// moving-flow (flow network; moving-flow takes state and actions), recording (flow network, with actions) or moving-mnist
@@ -35,10 +38,11 @@ pub(super) struct TrainArgs {
     /// enough, as with --set sequence.steps=300
     #[arg(long, value_name = "MODEL")]
     from: Option<String>,
-    /// The directory of a data set, or its name in `DATA_DIR/datasets` [default: static-observer; for moving
-    /// and moving-flow, moving-observer]
-    #[arg(long, value_name = "DATASET")]
-    dataset: Option<PathBuf>,
+    /// The directory of a data set, or its name in `DATA_DIR/datasets`; may be repeated. Each set gives equally many
+    /// windows, unless it has a weight, as in rooms=3 [default: static-observer; for moving and moving-flow,
+    /// moving-observer]
+    #[arg(long = "dataset", value_name = "DATASET[=WEIGHT]")]
+    datasets: Vec<WeightedDataset>,
     /// The directory of the run, for the configuration, the checkpoint and at the end the model [default: runs/NAME]
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
@@ -66,11 +70,18 @@ pub(super) fn run(args: &TrainArgs) -> Result<(), CliError> {
     if args.print_config {
         return print_line(config.to_toml()?.trim_end());
     }
-    let dataset = args
-        .dataset
-        .clone()
-        .unwrap_or_else(|| default_dataset(args, start.as_ref()));
-    let (dataset_dir, dataset) = workspace.open_dataset(&dataset)?;
+    let mut named = args.datasets.clone();
+    if named.is_empty() {
+        named.push(WeightedDataset::from(default_dataset(args, start.as_ref())));
+    }
+    let mut weighted = Vec::new();
+    let mut directories = Vec::new();
+    for WeightedDataset { place, weight } in &named {
+        let (directory, dataset) = workspace.open_dataset(place)?;
+        directories.push(directory);
+        weighted.push((dataset, *weight));
+    }
+    let dataset = Dataset::join(weighted)?;
     let run_dir = args
         .out
         .clone()
@@ -95,13 +106,16 @@ pub(super) fn run(args: &TrainArgs) -> Result<(), CliError> {
     match outcome? {
         TrainingOutcome::Finished { model_dir, manifest } => {
             evaluation::calibrate_trained(&model_dir, &dataset, &cancelled).map_err(CliError::not_calibrated)?;
+            let evaluations = directories.iter().map(|directory| {
+                let (model, dataset) = (model_dir.display(), directory.display());
+                format!("foreframe evaluate --model {model} --dataset {dataset}\n      ")
+            });
             print_line(format!(
-                "{}: {} parameters, validation {}\nnext: foreframe evaluate --model {} --dataset {}\n      foreframe publish {}",
+                "{}: {} parameters, validation {}\nnext: {}foreframe publish {}",
                 model_dir.display(),
                 manifest.parameters,
                 manifest.metrics["validation"],
-                model_dir.display(),
-                dataset_dir.display(),
+                evaluations.collect::<String>(),
                 run_dir.display(),
             ))
         }
@@ -125,6 +139,39 @@ fn training_config(args: &TrainArgs, start: Option<&StoredWeights>) -> Result<Tr
         Some(start) => TrainConfig::of_model(&start.manifest, layers)?,
         None => TrainConfig::from_layers(&args.preset, layers)?,
     })
+}
+
+/// A data set and the weight of its windows among those of the others.
+#[derive(Clone, Debug)]
+struct WeightedDataset {
+    place: PathBuf,
+    weight: f64,
+}
+
+impl From<PathBuf> for WeightedDataset {
+    fn from(place: PathBuf) -> Self {
+        Self { place, weight: 1.0 }
+    }
+}
+
+impl FromStr for WeightedDataset {
+    type Err = String;
+
+    /// A name or directory, with a weight after the last `=` if what follows it is a number.
+    fn from_str(text: &str) -> Result<Self, String> {
+        let Some((place, weight)) = text.rsplit_once('=') else {
+            return Ok(Self::from(PathBuf::from(text)));
+        };
+        match weight.parse::<f64>() {
+            Ok(weight) if weight.is_finite() && weight > 0.0 && !place.is_empty() => Ok(Self {
+                place: PathBuf::from(place),
+                weight,
+            }),
+            _ => Err(format!(
+                "\"{weight}\" is not a weight; write NAME=WEIGHT with a number above 0, as in rooms=0.3"
+            )),
+        }
+    }
 }
 
 fn default_dataset(args: &TrainArgs, start: Option<&StoredWeights>) -> PathBuf {

@@ -74,6 +74,7 @@ pub(crate) fn squares_spec(side: u32) -> ModelSpec {
 /// Names a data set as that of a training, with the split seed 7.
 pub(crate) fn stamp(dataset: &Dataset) -> DatasetStamp {
     DatasetStamp {
+        parts: Vec::new(),
         name: dataset.info().name.clone(),
         content_hash: dataset.info().content_hash.clone(),
         scenario: None,

@@ -48,6 +48,7 @@ mod lerobot;
 mod malformed_requests;
 mod malformed_streams;
 mod metrics;
+mod mixture;
 mod model_cards;
 mod moving_mnist;
 mod msgpack;

@@ -68,6 +68,7 @@ pub(crate) fn slow_spec() -> ModelSpec {
 /// Publishes a model with random weights below `dir` and loads it.
 pub(crate) fn model(dir: &Path, name: &str, spec: ModelSpec) -> Model {
     let trained_on = DatasetStamp {
+        parts: Vec::new(),
         name: "none".to_owned(),
         content_hash: String::new(),
         scenario: None,

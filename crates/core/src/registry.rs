@@ -18,7 +18,7 @@ pub use self::embedded::{EmbeddedModel, embed};
 pub use self::error::RegistryError;
 pub use self::layout::{MANIFEST_FILE, WEIGHTS_FILE};
 pub use self::loader::{Model, StoredWeights, load, load_as, load_weights};
-pub use self::manifest::{DatasetStamp, Manifest, ProgramStamp, set_git_commit};
+pub use self::manifest::{DatasetShare, DatasetStamp, Manifest, ProgramStamp, set_git_commit};
 use crate::files::{sha256_hex, write_atomically};
 use crate::nn::Parameters;
 use crate::types::ModelName;

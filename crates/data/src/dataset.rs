@@ -14,6 +14,8 @@ mod frame_store;
 
 mod opened;
 
+mod joined;
+
 pub mod sampler;
 
 pub mod background;
@@ -32,7 +34,7 @@ pub use collect::moving_mnist;
 pub use collect::{CollectConfig, CollectProgress, CollectionStatus, collect};
 pub use error::DatasetError;
 pub use foreframe_sim::TrialParameters;
-pub use info::{DatasetInfo, Episode, EpisodeData};
+pub use info::{DatasetInfo, DatasetPart, Episode, EpisodeData};
 pub use opened::Dataset;
 pub use sampler::{Split, Splits, Window, WindowShape};
 pub use store::catalog::{find, is_finished, list};

@@ -9,11 +9,13 @@ pub mod config;
 mod error;
 pub mod observer;
 pub mod optimizer;
+mod plan;
 mod preset;
 mod pretrain;
 mod principal_components;
 mod random_codec;
 mod sequence;
+mod shuffle;
 mod stage;
 mod start;
 mod state;
@@ -21,22 +23,19 @@ mod state;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
-use self::augment::Augmentation;
-use self::batches::FrameSource;
 pub use self::checkpoint::{CHECKPOINT_FILE, CheckpointPosition, seal, state_entry};
 use self::checkpoint::{HISTORY_FILE, MODEL_DIR, RunFiles, io_failed};
+use self::config::CodecStart;
 pub use self::config::TrainConfig;
-use self::config::{CodecStart, WindowBudget};
 pub use self::error::TrainError;
 pub use self::observer::{Observer, TrainingEvent, TrainingStage};
+use self::plan::{TrainingPlan, window_frames};
 use self::stage::{StageEnd, StageRunner};
 use self::state::TrainState;
 use foreframe_core::files::write_atomically;
-use foreframe_core::nn::spec::MIN_CHANNEL_STD;
-use foreframe_core::nn::{ModelSpec, Parameters};
-use foreframe_core::registry::{self, DatasetStamp, Manifest, ProgramStamp, StoredWeights};
-use foreframe_data::dataset::sampler::{Split, Splits};
-use foreframe_data::dataset::{Dataset, Window};
+use foreframe_core::nn::Parameters;
+use foreframe_core::registry::{self, Manifest, StoredWeights};
+use foreframe_data::dataset::Dataset;
 
 /// Largest number of frames from which the codec's initial weights are computed.
 const MAX_PRINCIPAL_FRAMES: usize = 8192;
@@ -137,7 +136,8 @@ pub fn run(
         return interrupted(TrainingStage::Sequence, state.progress.step);
     }
     state.restore_best()?;
-    let manifest = plan.manifest(training, &state)?;
+    let validation = objective.validation_by_part(&state.parameters)?;
+    let manifest = plan.manifest(training, &state, &validation)?;
     let history = serde_json::to_vec(&state.progress.history);
     let history =
         history.map_err(|error| TrainError::Config(format!("could not write the history as JSON: {error}")))?;
@@ -175,109 +175,4 @@ fn initial_parameters(
         }
     }
     Ok(Some(parameters))
-}
-
-/// What is fixed before the first step: the windows and the model specification.
-struct TrainingPlan<'a> {
-    source: FrameSource<'a>,
-    spec: ModelSpec,
-    train: Vec<Window>,
-    validation: Vec<Window>,
-}
-
-impl<'a> TrainingPlan<'a> {
-    fn new(config: &TrainConfig, dataset: &'a Dataset) -> Result<Self, TrainError> {
-        let shape = config.window_shape();
-        let splits = Splits::new(dataset, config.data.split_seed);
-        let available = splits.windows(dataset, Split::Train, shape, 1)?;
-        let validation = splits.windows(dataset, Split::Validation, shape, 1)?;
-        if available.is_empty() || validation.is_empty() {
-            return Err(TrainError::NoWindows {
-                train: available.len(),
-                validation: validation.len(),
-                frames: shape.frames(),
-            });
-        }
-        let train = match config.data.windows {
-            WindowBudget::Count(count) => {
-                splits.sample(dataset, Split::Train, shape, count, config.seed.derive("windows", 0))?
-            }
-            WindowBudget::All => available,
-        };
-        let stride = validation.len().div_ceil(config.data.validation_windows).max(1);
-        let validation = validation.into_iter().step_by(stride).collect();
-        let frames = window_frames(&train, shape.context + shape.horizon);
-        let spec = config.model_spec(dataset, &frames);
-        check_actions(config, dataset, &spec)?;
-        spec.validate()?;
-        let augmentation = Augmentation::new(&config.data, dataset, &frames, config.seed)?;
-        Ok(Self {
-            source: FrameSource::new(dataset, spec.preprocess, config.sequence.target, augmentation),
-            spec,
-            train,
-            validation,
-        })
-    }
-
-    fn manifest(&self, training: &Training<'_>, state: &TrainState) -> Result<Manifest, TrainError> {
-        let (config, info) = (training.config, training.dataset.info());
-        let mut settings = serde_json::to_value(config).map_err(|error| TrainError::Config(error.to_string()))?;
-        if let Some(start) = training.start {
-            settings[START_KEY] = serde_json::json!({
-                "model": start.manifest.name,
-                "version": start.manifest.version,
-                "weights_sha256": start.manifest.weights_sha256,
-            });
-        }
-        Ok(Manifest {
-            name: config.name.clone(),
-            version: 1,
-            spec: self.spec.clone(),
-            weights_sha256: String::new(),
-            dataset: DatasetStamp {
-                name: info.name.clone(),
-                content_hash: info.content_hash.clone(),
-                scenario: info.scenario.clone(),
-                windows: self.train.len(),
-                split_seed: config.data.split_seed,
-            },
-            seed: config.seed,
-            command: training.command.to_owned(),
-            training: settings,
-            metrics: serde_json::json!({
-                "validation": { "mse": state.progress.best_loss, "step": state.progress.best_step }
-            }),
-            calibration: None,
-            parameters: self.spec.parameter_count(),
-            multiply_adds_per_frame: self.spec.multiply_adds_per_frame(),
-            program: ProgramStamp::current(),
-        })
-    }
-}
-
-/// Errors: `ConstantActions` if the model takes actions that never change, so that it could not learn what they do.
-fn check_actions(config: &TrainConfig, dataset: &Dataset, spec: &ModelSpec) -> Result<(), TrainError> {
-    let never_change =
-        spec.action_inputs().is_some() && spec.actions.iter().all(|action| action.std <= MIN_CHANNEL_STD);
-    if !never_change || config.data.constant_actions {
-        return Ok(());
-    }
-    Err(TrainError::ConstantActions {
-        dataset: dataset.info().name.clone(),
-        has_actions: !spec.actions.is_empty(),
-        conditioning: spec.conditioning,
-    })
-}
-
-/// The distinct frames of windows of `length` frames, in increasing order.
-fn window_frames(windows: &[Window], length: usize) -> Vec<usize> {
-    let mut starts: Vec<usize> = windows.iter().map(|window| window.first_frame).collect();
-    starts.sort_unstable();
-    let (mut frames, mut next) = (Vec::new(), 0);
-    for start in starts {
-        // Windows overlap; each frame is listed once.
-        frames.extend(next.max(start)..start + length);
-        next = start + length;
-    }
-    frames
 }

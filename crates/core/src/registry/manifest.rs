@@ -64,6 +64,33 @@ pub struct DatasetStamp {
     pub windows: usize,
     /// The seed of the split into training, validation and test parts.
     pub split_seed: Seed,
+    /// The data sets that were joined; none if it is a single one.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub parts: Vec<DatasetShare>,
+}
+
+impl DatasetStamp {
+    /// Whether the model was trained on the data set with this content, alone or among others.
+    #[must_use]
+    pub fn includes(&self, content_hash: &str) -> bool {
+        self.content_hash == content_hash || self.parts.iter().any(|part| part.content_hash == content_hash)
+    }
+}
+
+/// One of several data sets on which a model was trained.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct DatasetShare {
+    /// Its name.
+    pub name: String,
+    /// SHA-256 of its content.
+    pub content_hash: String,
+    /// The simulated scenario; none for recordings.
+    pub scenario: Option<String>,
+    /// Number of training windows.
+    pub windows: usize,
+    /// Its share of the windows that the training drew, 0 to 1.
+    pub share: f64,
 }
 
 /// Version of the program that wrote a file.

@@ -2,9 +2,11 @@
 
 pub(super) mod frame_file;
 
+use std::borrow::Cow;
 use std::sync::Arc;
 
 use self::frame_file::FrameFile;
+use super::DatasetError;
 
 /// What was read of some frames, in their order. The images are left out if they are in a file.
 #[derive(Default)]
@@ -32,4 +34,29 @@ impl FrameContent {
 pub(super) enum FrameStore {
     Memory(Vec<Box<[u8]>>),
     File(Arc<FrameFile>),
+    /// Those of joined data sets, each with its first frame. Their masks are not among them.
+    Joined(Vec<(usize, FrameStore)>),
+}
+
+impl FrameStore {
+    /// The pixels of an image: borrowed from memory, or read from the file. Panics if there is no such image.
+    pub(super) fn read(&self, image: usize) -> Result<Cow<'_, [u8]>, DatasetError> {
+        match self {
+            Self::Memory(images) => Ok(Cow::Borrowed(&images[image])),
+            Self::File(file) => file.read(image).map(Cow::Owned),
+            Self::Joined(stores) => {
+                let (first, store) = &stores[stores.partition_point(|&(first, _)| first <= image) - 1];
+                store.read(image - first)
+            }
+        }
+    }
+
+    /// Bytes of the images in memory.
+    pub(super) fn bytes_in_memory(&self) -> usize {
+        match self {
+            Self::Memory(images) => images.iter().map(|image| image.len()).sum(),
+            Self::File(_) => 0,
+            Self::Joined(stores) => stores.iter().map(|(_, store)| store.bytes_in_memory()).sum(),
+        }
+    }
 }

@@ -93,6 +93,17 @@ impl Episode {
     }
 }
 
+/// A part of a data set: all of it, or one of those that were joined.
+#[derive(Clone, Debug, PartialEq)]
+pub struct DatasetPart {
+    /// The description of the part.
+    pub info: DatasetInfo,
+    /// The positions of its episodes.
+    pub episodes: Range<usize>,
+    /// Its share of the training windows, 0 to 1.
+    pub share: f64,
+}
+
 /// The data of one episode. Each field holds one item per frame, one after another.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct EpisodeData {

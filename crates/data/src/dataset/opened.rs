@@ -8,7 +8,7 @@ use sha2::{Digest, Sha256};
 use super::check::{check_description, check_episode};
 use super::frame_store::frame_file::FrameFile;
 use super::frame_store::{FrameContent, FrameStore};
-use super::{DatasetError, DatasetInfo, Episode, EpisodeData};
+use super::{DatasetError, DatasetInfo, DatasetPart, Episode, EpisodeData};
 use foreframe_core::frame::Frame;
 use foreframe_core::frame::warp::CameraModel;
 use foreframe_sim::CameraConfig;
@@ -17,11 +17,13 @@ use foreframe_sim::CameraConfig;
 #[derive(Clone, Debug, PartialEq)]
 pub struct Dataset {
     pub(super) info: DatasetInfo,
-    episodes: Vec<Episode>,
-    images: FrameStore,
-    actions: Vec<f32>,
-    states: Vec<f32>,
-    timestamps_s: Vec<f64>,
+    /// Those that were joined; empty if the data set is not joined.
+    pub(super) parts: Vec<DatasetPart>,
+    pub(super) episodes: Vec<Episode>,
+    pub(super) images: FrameStore,
+    pub(super) actions: Vec<f32>,
+    pub(super) states: Vec<f32>,
+    pub(super) timestamps_s: Vec<f64>,
 }
 
 impl Dataset {
@@ -83,6 +85,7 @@ impl Dataset {
         content.pixels.append(&mut content.masks);
         Self {
             info,
+            parts: Vec::new(),
             episodes,
             images: file.map_or(FrameStore::Memory(content.pixels), |file| {
                 FrameStore::File(Arc::new(file))
@@ -126,14 +129,34 @@ impl Dataset {
         &self.episodes
     }
 
+    /// The parts in order; one that is the whole data set if it was not joined.
+    #[must_use]
+    pub fn parts(&self) -> Vec<DatasetPart> {
+        if self.parts.is_empty() {
+            return vec![DatasetPart {
+                info: self.info.clone(),
+                episodes: 0..self.episodes.len(),
+                share: 1.0,
+            }];
+        }
+        self.parts.clone()
+    }
+
+    /// The description of the part that this episode belongs to.
+    fn info_of(&self, episode: usize) -> &DatasetInfo {
+        let part = self.parts.iter().find(|part| part.episodes.contains(&episode));
+        part.map_or(&self.info, |part| &part.info)
+    }
+
     /// The camera of an episode: that of its trial, else the one of all trials, both with their height, else the one in the
     /// description. None where no camera is known.
     #[must_use]
     pub fn camera(&self, episode: usize) -> Option<CameraModel> {
         let trial = self.episodes.get(episode).and_then(|episode| episode.trial.as_ref());
         let own = trial.and_then(|trial| trial.room.as_ref()).map(|room| &room.camera);
-        let simulated = own.or_else(|| self.info.common_camera());
-        simulated.map(CameraConfig::model_with_height).or(self.info.camera)
+        let info = self.info_of(episode);
+        let simulated = own.or_else(|| info.common_camera());
+        simulated.map(CameraConfig::model_with_height).or(info.camera)
     }
 
     /// The camera of each of the episodes, given by position; empty unless all are known.
@@ -159,10 +182,7 @@ impl Dataset {
     fn image(&self, first: usize, frame: usize) -> Result<Cow<'_, [u8]>, DatasetError> {
         let frames = self.info.frame_count;
         assert!(frame < frames, "frame {frame} of {frames} frames is a bug");
-        match &self.images {
-            FrameStore::Memory(images) => Ok(Cow::Borrowed(&images[first + frame])),
-            FrameStore::File(file) => file.read(first + frame).map(Cow::Owned),
-        }
+        self.images.read(first + frame)
     }
 
     /// A frame. Panics if there is no such frame. Errors: as [`Dataset::pixels`].
@@ -174,10 +194,7 @@ impl Dataset {
     /// Bytes of frames and masks that this data set holds in memory; 0 if they are in a file.
     #[must_use]
     pub fn frame_bytes_in_memory(&self) -> usize {
-        match &self.images {
-            FrameStore::Memory(images) => images.iter().map(|image| image.len()).sum(),
-            FrameStore::File(_) => 0,
-        }
+        self.images.bytes_in_memory()
     }
 
     /// The action from this frame to the next. Panics if there is no such frame.

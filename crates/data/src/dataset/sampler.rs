@@ -114,20 +114,11 @@ impl Splits {
     /// Splits the data set with this seed.
     #[must_use]
     pub fn new(dataset: &Dataset, split_seed: Seed) -> Self {
-        let episodes = dataset.episodes();
-        let trials: Option<Vec<&TrialParameters>> = episodes.iter().map(|episode| episode.trial.as_ref()).collect();
-        match trials {
-            Some(trials) => {
-                let splits = trials.into_iter().map(|trial| match trial {
-                    trial if trial.has_held_out_pair() => Split::UnseenPairs,
-                    trial if trial.is_held_out() => Split::UnseenGains,
-                    trial => split_of(split_seed, trial.trial),
-                });
-                Self::of(dataset, splits.zip(episodes.iter().map(EpisodeSegment::whole)))
-            }
-            None if episodes.len() >= WHOLE_EPISODES => Self::of(dataset, whole_episodes(dataset)),
-            None => Self::of(dataset, by_time(dataset)),
-        }
+        let parts = dataset.parts().into_iter();
+        Self::of(
+            dataset,
+            parts.flat_map(|part| split_part(&dataset.episodes()[part.episodes], split_seed)),
+        )
     }
 
     /// Every episode in the test split, for a data set that holds nothing but test data.
@@ -239,12 +230,36 @@ impl Splits {
     }
 }
 
+/// The segments of the episodes of one data set.
+fn split_part(episodes: &[Episode], split_seed: Seed) -> Vec<(Split, EpisodeSegment)> {
+    let trials: Option<Vec<&TrialParameters>> = episodes.iter().map(|episode| episode.trial.as_ref()).collect();
+    let whole = episodes.iter().map(EpisodeSegment::whole);
+    match trials {
+        Some(trials) => {
+            let splits = trials.into_iter().map(|trial| match trial {
+                trial if trial.has_held_out_pair() => Split::UnseenPairs,
+                trial if trial.is_held_out() => Split::UnseenGains,
+                trial => split_of(split_seed, trial.trial),
+            });
+            splits.zip(whole).collect()
+        }
+        None if episodes.len() >= WHOLE_EPISODES => whole_episodes(episodes),
+        None => by_time(episodes),
+    }
+}
+
+/// The frames of these episodes, which follow one another.
+fn frames_of(episodes: &[Episode]) -> Range<usize> {
+    let (first, last) = (episodes.first(), episodes.last());
+    first.map_or(0, |first| first.first_frame)..last.map_or(0, |last| last.frames().end)
+}
+
 /// Splits complete episodes by time. The last ones, with at least a tenth of all frames, are for testing; the ones before
 /// them, with at least a tenth, for validation; the others for training.
-fn whole_episodes(dataset: &Dataset) -> Vec<(Split, EpisodeSegment)> {
-    let tenth = dataset.info().frame_count.div_ceil(10);
+fn whole_episodes(episodes: &[Episode]) -> Vec<(Split, EpisodeSegment)> {
+    let tenth = frames_of(episodes).len().div_ceil(10);
     let (mut test, mut validation) = (0, 0);
-    let backwards = dataset.episodes().iter().rev().map(|episode| {
+    let backwards = episodes.iter().rev().map(|episode| {
         let split = if test < tenth {
             test += episode.frame_count;
             Split::Test
@@ -262,22 +277,23 @@ fn whole_episodes(dataset: &Dataset) -> Vec<(Split, EpisodeSegment)> {
 }
 
 /// Splits all frames by time: the first 80 % for training, the next 10 % for validation, the last 10 % for testing.
-fn by_time(dataset: &Dataset) -> impl Iterator<Item = (Split, EpisodeSegment)> {
-    let frame_count = dataset.info().frame_count;
-    let (validation, test) = (frame_count * 8 / 10, frame_count * 9 / 10);
+fn by_time(episodes: &[Episode]) -> Vec<(Split, EpisodeSegment)> {
+    let all = frames_of(episodes);
+    let (validation, test) = (all.start + all.len() * 8 / 10, all.start + all.len() * 9 / 10);
     let parts = [
-        (Split::Train, 0..validation),
+        (Split::Train, all.start..validation),
         (Split::Validation, validation..test),
-        (Split::Test, test..frame_count),
+        (Split::Test, test..all.end),
     ];
-    parts.into_iter().flat_map(|(split, part)| {
-        let segments = dataset.episodes().iter().map(move |whole| EpisodeSegment {
+    let segments = parts.into_iter().flat_map(|(split, part)| {
+        let segments = episodes.iter().map(move |whole| EpisodeSegment {
             episode: whole.index,
             frames: whole.frames().start.max(part.start)..whole.frames().end.min(part.end),
         });
         let segments = segments.filter(|segment| !segment.frames.is_empty());
         segments.map(move |segment| (split, segment))
-    })
+    });
+    segments.collect()
 }
 
 /// The split of a trial. In each block of ten trials, one is for validation and one for testing, drawn from seed and block.

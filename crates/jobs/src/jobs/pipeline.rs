@@ -104,8 +104,11 @@ impl Pipeline {
         });
         checked.await.unwrap_or(Err(JobError::Stopping))?;
         let JobSpec::Train(spec) = spec else { return Ok(()) };
-        let (config, dataset) = (spec.config()?, datasets::describe(objects, &spec.dataset).await?);
-        self.resources.memory.check(&config, &dataset)
+        let mut dataset = datasets::describe(objects, &spec.dataset).await?;
+        for name in spec.mixture.keys() {
+            dataset.frame_count += datasets::describe(objects, name).await?.frame_count;
+        }
+        self.resources.memory.check(&spec.config()?, &dataset)
     }
 
     fn collect(
@@ -140,7 +143,11 @@ impl Pipeline {
         report.progress(0, 0, "reading the data set");
         let retry = self.retry_policy(report, cancelled);
         retry.run(async || self.prepare_run(&run, report).await)?;
-        let dataset = self.dataset(&spec.dataset, &retry)?;
+        let held_mib = self.resources.memory.held_mib() / (1 + spec.mixture.len() as u64);
+        let opened = spec
+            .datasets()
+            .map(|(name, weight)| Ok((self.dataset(name, held_mib, &retry)?, weight)));
+        let dataset = Dataset::join(opened.collect::<Result<_, JobFailure>>()?).map_err(|error| failed(&error))?;
         let training = Training {
             config: &config,
             dataset: &dataset,
@@ -202,7 +209,7 @@ impl Pipeline {
         let loaded = model(&spec.model, spec.version)?;
         let twin = spec.twin.as_ref().map(|twin| model(twin, None)).transpose()?;
         report.progress(0, 0, "reading the data set");
-        let dataset = self.dataset(&spec.dataset, &retry)?;
+        let dataset = self.dataset(&spec.dataset, self.resources.memory.held_mib(), &retry)?;
         let config = EvaluateConfig {
             max_windows: spec.windows,
             bootstrap_samples: spec.resamples,
@@ -254,9 +261,10 @@ impl Pipeline {
         }
     }
 
-    fn dataset(&self, name: &DatasetName, retry: &RetryPolicy<'_>) -> Result<Dataset, JobFailure> {
+    /// Opens a data set with at most `held_mib` MiB of its frames in memory.
+    fn dataset(&self, name: &DatasetName, held_mib: u64, retry: &RetryPolicy<'_>) -> Result<Dataset, JobFailure> {
         let fetched = retry.run(async || datasets::fetch(self.store.objects(), name).await)?;
-        Dataset::open_within(&fetched, self.resources.memory.held_mib()).map_err(|error| failed(&error))
+        Dataset::open_within(&fetched, held_mib).map_err(|error| failed(&error))
     }
 
     /// Copies a finished data set to the object store, if there is a shared one, and returns the job's result.

@@ -3,6 +3,7 @@
 mod import;
 
 use std::collections::BTreeMap;
+use std::iter;
 use std::ops::RangeInclusive;
 use std::path::Path;
 use std::str::FromStr;
@@ -82,6 +83,11 @@ pub struct TrainSpec {
     #[serde(deserialize_with = "dataset")]
     #[schema(value_type = String)]
     pub dataset: DatasetName,
+    /// Further data sets to train on, each with a weight above 0: how many windows it gives for one of `dataset`. Frame size,
+    /// frame period and channels must be those of `dataset`.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    #[schema(value_type = BTreeMap<String, f64>)]
+    pub mixture: BTreeMap<DatasetName, f64>,
     /// Settings that replace those of the preset.
     #[serde(default, skip_serializing_if = "serde_json::Map::is_empty")]
     #[schema(value_type = Object)]
@@ -179,14 +185,14 @@ impl JobSpec {
         }
     }
 
-    /// The data set that it writes or reads.
+    /// The data sets that it writes or reads.
     #[must_use]
-    pub fn dataset(&self) -> &DatasetName {
+    pub fn datasets(&self) -> Vec<&DatasetName> {
         match self {
-            Self::Collect(spec) => &spec.name,
-            Self::Import(spec) => &spec.name,
-            Self::Train(spec) => &spec.dataset,
-            Self::Evaluate(spec) => &spec.dataset,
+            Self::Collect(spec) => vec![&spec.name],
+            Self::Import(spec) => vec![&spec.name],
+            Self::Train(spec) => spec.datasets().map(|(name, _)| name).collect(),
+            Self::Evaluate(spec) => vec![&spec.dataset],
         }
     }
 
@@ -266,7 +272,24 @@ impl CollectSpec {
 impl TrainSpec {
     fn check(&self, datasets: &[DatasetName]) -> Result<(), JobError> {
         self.config()?;
-        check_dataset(&self.dataset, datasets)
+        check_dataset(&self.dataset, datasets)?;
+        for (name, weight) in &self.mixture {
+            check_known(("mixture", "data set"), name, datasets.iter())?;
+            if !(weight.is_finite() && *weight > 0.0) {
+                let reason = format!("the weight of \"{name}\" is {weight}; it must be above 0");
+                return Err(JobError::invalid("mixture", reason));
+            }
+            if *name == self.dataset {
+                let reason = format!("\"{name}\" is the data set itself, which has the weight 1");
+                return Err(JobError::invalid("mixture", reason));
+            }
+        }
+        Ok(())
+    }
+
+    /// All data sets with their weights.
+    pub(super) fn datasets(&self) -> impl Iterator<Item = (&DatasetName, f64)> {
+        iter::once((&self.dataset, 1.0)).chain(self.mixture.iter().map(|(name, weight)| (name, *weight)))
     }
 
     /// The preset with the job's settings. Errors: `Invalid`, which names the presets or the setting.
@@ -384,9 +407,32 @@ mod tests {
             name: "a".parse().unwrap(),
             preset: "papr".to_owned(),
             dataset: "d".parse().unwrap(),
+            mixture: BTreeMap::new(),
             settings: serde_json::Map::new(),
         };
         let error = spec.check(&[]).unwrap_err().to_string();
         assert!(error.starts_with("preset: ") && error.contains("moving"), "{error}");
+    }
+
+    #[test]
+    fn a_mixture_names_other_data_sets_with_weights_above_0() {
+        let known: Vec<DatasetName> = ["a", "b"].map(|name| name.parse().unwrap()).into();
+        let check = |mixture: &[(&str, f64)]| {
+            let spec = TrainSpec {
+                name: "m".parse().unwrap(),
+                preset: "paper".to_owned(),
+                dataset: "a".parse().unwrap(),
+                mixture: mixture
+                    .iter()
+                    .map(|&(name, weight)| (name.parse().unwrap(), weight))
+                    .collect(),
+                settings: serde_json::Map::new(),
+            };
+            spec.check(&known).map_err(|error| error.to_string())
+        };
+        assert_eq!(check(&[("b", 0.3)]), Ok(()));
+        assert!(check(&[("b", 0.0)]).unwrap_err().contains("the weight of \"b\" is 0"));
+        assert!(check(&[("a", 1.0)]).unwrap_err().contains("is the data set itself"));
+        assert!(check(&[("c", 1.0)]).unwrap_err().starts_with("mixture: "));
     }
 }

@@ -49,7 +49,7 @@ pub(super) fn check(loaded: &Model, dataset: &Dataset) -> Result<(), EvaluationE
 
 /// Errors: `TrainedOn` if the model was trained on this data set, so that it cannot be tested on all of it.
 pub(super) fn check_untrained(loaded: &Model, dataset: &Dataset) -> Result<(), EvaluationError> {
-    if loaded.manifest.dataset.content_hash == dataset.info().content_hash {
+    if loaded.manifest.dataset.includes(&dataset.info().content_hash) {
         return Err(EvaluationError::TrainedOn {
             model: loaded.manifest.name.clone(),
             dataset: dataset.info().name.clone(),
@@ -63,7 +63,7 @@ pub(super) fn check_untrained(loaded: &Model, dataset: &Dataset) -> Result<(), E
 pub(super) fn split_seed(loaded: &Model, dataset: &Dataset, asked: Option<Seed>) -> Result<Seed, EvaluationError> {
     let trained = &loaded.manifest.dataset;
     let seed = asked.unwrap_or(trained.split_seed);
-    if seed != trained.split_seed && trained.content_hash == dataset.info().content_hash {
+    if seed != trained.split_seed && trained.includes(&dataset.info().content_hash) {
         return Err(EvaluationError::SplitSeed {
             model: loaded.manifest.name.clone(),
             trained: trained.split_seed.0,

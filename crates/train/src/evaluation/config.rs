@@ -40,7 +40,7 @@ impl ScoredSplit {
     /// What is scored where this is asked for: all of a data set whose rooms are only for tests, unless the model was
     /// trained in them.
     pub(super) fn of(self, loaded: &Model, dataset: &Dataset) -> Self {
-        let was_seen = loaded.manifest.dataset.content_hash == dataset.info().content_hash;
+        let was_seen = loaded.manifest.dataset.includes(&dataset.info().content_hash);
         match self {
             Self::Test if test_rooms(dataset).is_some() && !was_seen => Self::WholeSet,
             split => split,

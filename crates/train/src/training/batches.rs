@@ -1,9 +1,6 @@
-//! Makes batches of frames and windows as tensors, and shuffles the training data.
-
-use std::sync::{Arc, Mutex, PoisonError};
+//! Makes batches of frames and windows as tensors.
 
 use candle_core::{Device, Tensor};
-use rand::seq::SliceRandom;
 use rayon::prelude::*;
 
 use super::TrainError;
@@ -11,7 +8,6 @@ use super::augment::{ACTION, Augmentation, STATE, WindowChange};
 use super::config::Target;
 use foreframe_core::frame::preprocess::Preprocess;
 use foreframe_core::nn::ConditioningTensors;
-use foreframe_core::types::Seed;
 use foreframe_data::dataset::sampler::WindowShape;
 use foreframe_data::dataset::{Dataset, Window};
 
@@ -189,57 +185,11 @@ fn unchanged(frames: &[usize]) -> Vec<(usize, WindowChange)> {
     frames.iter().map(|&frame| (frame, WindowChange::NONE)).collect()
 }
 
-/// Draws positions `0..count`, each once per epoch. The order depends only on the seed and the number of the draw, so that a
-/// resumed training draws the same positions as an uninterrupted one.
-pub(super) struct Shuffle {
-    count: usize,
-    seed: Seed,
-    /// The order of the epoch that was drawn from last: to shuffle millions of positions for each batch would take long.
-    last: Mutex<(usize, Arc<Vec<usize>>)>,
-}
-
-impl Shuffle {
-    /// Shuffles `count` positions. `count` is at least 1: a training without windows is refused earlier.
-    pub(super) fn new(count: usize, seed: Seed) -> Self {
-        Self {
-            count,
-            seed,
-            last: Mutex::new((usize::MAX, Arc::default())),
-        }
-    }
-
-    /// The positions of batch number `step`. A batch larger than the number of positions continues in the next epoch.
-    pub(super) fn batch(&self, step: usize, batch_size: usize) -> Vec<usize> {
-        let draws = step * batch_size..(step + 1) * batch_size;
-        let (mut epoch, mut order) = (usize::MAX, Arc::default());
-        draws
-            .map(|draw| {
-                if draw / self.count != epoch {
-                    epoch = draw / self.count;
-                    order = self.order(epoch);
-                }
-                order[draw % self.count]
-            })
-            .collect()
-    }
-
-    /// The positions in the order of an epoch.
-    fn order(&self, epoch: usize) -> Arc<Vec<usize>> {
-        let mut last = self.last.lock().unwrap_or_else(PoisonError::into_inner);
-        if last.0 != epoch {
-            let mut order: Vec<usize> = (0..self.count).collect();
-            order.shuffle(&mut self.seed.derive("epoch", epoch as u64).rng());
-            *last = (epoch, Arc::new(order));
-        }
-        Arc::clone(&last.1)
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::training::TrainConfig;
-    use foreframe_core::types::Channel;
+    use foreframe_core::types::{Channel, Seed};
     use foreframe_data::dataset::{DatasetInfo, EpisodeData};
 
     /// Four frames of one pixel. Intensity and state of frame n are n / 5.
@@ -294,27 +244,5 @@ mod tests {
         };
         assert_eq!(played(false), all(&[0.0, 0.2, 0.4], 0.4, 0.6));
         assert_eq!(played(true), all(&[0.6, 0.4, 0.2], 0.2, 0.0));
-    }
-
-    #[test]
-    fn an_epoch_draws_every_position_once() {
-        let shuffle = Shuffle::new(10, Seed(3));
-        let mut first: Vec<usize> = (0..2).flat_map(|step| shuffle.batch(step, 5)).collect();
-        first.sort_unstable();
-        assert_eq!(first, (0..10).collect::<Vec<_>>());
-    }
-
-    #[test]
-    fn a_batch_larger_than_the_data_repeats_positions() {
-        let mut batch = Shuffle::new(3, Seed(1)).batch(0, 6);
-        batch.sort_unstable();
-        assert_eq!(batch, [0, 0, 1, 1, 2, 2]);
-    }
-
-    #[test]
-    fn a_batch_does_not_depend_on_earlier_batches() {
-        let (early, late) = (Shuffle::new(7, Seed(1)), Shuffle::new(7, Seed(1)));
-        (0..9).for_each(|step| drop(early.batch(step, 4)));
-        assert_eq!(early.batch(9, 4), late.batch(9, 4));
     }
 }

@@ -50,10 +50,12 @@ pub enum TrainError {
     RenamedSettings(PathBuf),
     /// The training split or the validation split has no window.
     #[error(
-        "the data set has {train} training windows and {validation} validation windows of {frames} frames; training needs \
+        "the data set \"{dataset}\" has {train} training windows and {validation} validation windows of {frames} frames; training needs \
          at least 1 of each: collect 40 trials or more"
     )]
     NoWindows {
+        /// The data set's name.
+        dataset: String,
         /// Windows of the training split.
         train: usize,
         /// Windows of the validation split.

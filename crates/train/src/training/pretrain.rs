@@ -2,12 +2,14 @@
 
 use candle_core::Tensor;
 
-use super::batches::Shuffle;
+use super::TrainError;
 use super::config::TrainConfig;
+use super::plan::{TrainingPlan, window_frames};
+use super::shuffle::Shuffle;
 use super::stage::{BatchPart, Objective};
-use super::{TrainError, TrainingPlan, window_frames};
 use foreframe_core::nn::loss::Loss;
 use foreframe_core::nn::{Network, Parameters};
+use foreframe_data::dataset::Window;
 
 /// Largest number of validation frames used to choose the best codec.
 const MAX_VALIDATION_FRAMES: usize = 1024;
@@ -26,7 +28,8 @@ impl<'a> CodecObjective<'a> {
     pub(super) fn new(plan: &'a TrainingPlan<'a>, config: &'a TrainConfig) -> Result<Self, TrainError> {
         let length = config.model.context + config.model.horizon;
         let frames = window_frames(&plan.train, length);
-        let validation = window_frames(&plan.validation, length);
+        let validation: Vec<Window> = plan.mixture.iter().flat_map(|part| part.validation.clone()).collect();
+        let validation = window_frames(&validation, length);
         let stride = validation.len().div_ceil(MAX_VALIDATION_FRAMES).max(1);
         let validation: Vec<usize> = validation.into_iter().step_by(stride).collect();
         Ok(Self {
@@ -66,7 +69,7 @@ mod tests {
 
     use super::*;
     use foreframe_core::types::Seed;
-    use foreframe_data::dataset::{Dataset, DatasetInfo, EpisodeData, Window};
+    use foreframe_data::dataset::{Dataset, DatasetInfo, EpisodeData};
 
     const SIDE_PX: u32 = 8;
 

@@ -2,10 +2,12 @@
 
 use candle_core::Tensor;
 
-use super::batches::{DrawnWindow, Shuffle, WindowBatch};
+use super::TrainError;
+use super::batches::{DrawnWindow, WindowBatch};
 use super::config::{CodecTraining, TrainConfig, TrainingFeedback};
+use super::plan::{MixturePart, TrainingPlan};
+use super::shuffle::Shuffle;
 use super::stage::{BatchPart, Objective};
-use super::{TrainError, TrainingPlan};
 use foreframe_core::nn::loss::Loss;
 use foreframe_core::nn::ssim_loss::ssim_loss;
 use foreframe_core::nn::{Feedback, Network, Parameters};
@@ -29,7 +31,7 @@ impl<'a> SequenceObjective<'a> {
         Self {
             plan,
             config,
-            shuffle: Shuffle::new(plan.train.len(), config.seed.derive(SHUFFLE, 0)),
+            shuffle: Shuffle::mixed(&plan.drawn_parts(), config.seed.derive(SHUFFLE, 0)),
         }
     }
 
@@ -78,6 +80,23 @@ impl<'a> SequenceObjective<'a> {
         let frames = model.decode_frames(&features.reshape((batch * time, width))?)?;
         Ok(frames.reshape((batch, time, ()))?)
     }
+
+    /// The mean squared error on the validation windows of each part of the data set.
+    pub(super) fn validation_by_part(&self, parameters: &Parameters) -> Result<Vec<f64>, TrainError> {
+        let model = Network::new(self.plan.spec.clone(), parameters)?;
+        let of_part = |part: &MixturePart| {
+            let windows: Vec<DrawnWindow> = part.validation.iter().map(DrawnWindow::unchanged).collect();
+            let mut sum = 0.0;
+            for chunk in windows.chunks(VALIDATION_BATCH_SIZE) {
+                let batch = self.plan.source.windows(chunk, self.config.window_shape(), false)?;
+                let predicted = model.predict_frames(&batch.inputs, &batch.condition)?;
+                let loss = Loss::Mse.between(&predicted, &batch.targets)?.to_scalar::<f32>()?;
+                sum += f64::from(loss) * chunk.len() as f64;
+            }
+            Ok(sum / windows.len() as f64)
+        };
+        self.plan.mixture.iter().map(of_part).collect()
+    }
 }
 
 impl Objective for SequenceObjective<'_> {
@@ -125,15 +144,8 @@ impl Objective for SequenceObjective<'_> {
     }
 
     fn validation_loss(&self, parameters: &Parameters) -> Result<f64, TrainError> {
-        let model = Network::new(self.plan.spec.clone(), parameters)?;
-        let windows: Vec<DrawnWindow> = self.plan.validation.iter().map(DrawnWindow::unchanged).collect();
-        let mut sum = 0.0;
-        for chunk in windows.chunks(VALIDATION_BATCH_SIZE) {
-            let batch = self.plan.source.windows(chunk, self.config.window_shape(), false)?;
-            let predicted = model.predict_frames(&batch.inputs, &batch.condition)?;
-            let loss = Loss::Mse.between(&predicted, &batch.targets)?.to_scalar::<f32>()?;
-            sum += f64::from(loss) * chunk.len() as f64;
-        }
-        Ok(sum / windows.len().max(1) as f64)
+        let parts = self.validation_by_part(parameters)?;
+        let shares = self.plan.mixture.iter().map(|part| part.part.share);
+        Ok(parts.into_iter().zip(shares).map(|(mse, share)| mse * share).sum())
     }
 }

@@ -1,6 +1,7 @@
 //! Fine-tuning: a training that starts from the weights of another model.
 
-use super::{TrainError, TrainingPlan};
+use super::TrainError;
+use super::plan::TrainingPlan;
 use foreframe_core::error_text::comma_separated;
 use foreframe_core::nn::Parameters;
 use foreframe_core::registry::StoredWeights;

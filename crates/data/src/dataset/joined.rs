@@ -1,0 +1,160 @@
+//! Several data sets as one, each with its share of the training windows.
+
+use sha2::{Digest, Sha256};
+
+use super::frame_store::{FrameContent, FrameStore};
+use super::{Dataset, DatasetError, DatasetInfo, DatasetPart, Episode};
+use foreframe_core::error_text::comma_separated;
+use foreframe_core::types::Channel;
+
+/// Frame periods may differ by this factor: cameras are not exact.
+const MAX_PERIOD_RATIO: f64 = 1.1;
+
+impl Dataset {
+    /// Joins data sets, each with its weight: the share of a part is its weight over the sum of all. Frame size, frame period
+    /// and channels are those of the first. The channels of the others are found by name and unit; those that the first does
+    /// not have are left out, and so are masks. One data set stays as it is. Errors: `Usage` if there is none, a weight is not
+    /// above 0, a data set occurs twice, or sizes, periods or channels do not fit.
+    pub fn join(weighted: Vec<(Self, f64)>) -> Result<Self, DatasetError> {
+        check_weights(&weighted)?;
+        if weighted.len() == 1 {
+            return Ok(weighted
+                .into_iter()
+                .map(|(dataset, _)| dataset)
+                .collect::<Vec<_>>()
+                .remove(0));
+        }
+        let first = weighted
+            .first()
+            .map(|(dataset, _)| dataset.info.clone())
+            .unwrap_or_default();
+        let sum: f64 = weighted.iter().map(|(_, weight)| weight).sum();
+        let (mut parts, mut episodes, mut stores) = (Vec::new(), Vec::new(), Vec::new());
+        let mut content = FrameContent::default();
+        let mut hasher = Sha256::new();
+        for (dataset, weight) in weighted {
+            check_fit(&first, &dataset.info)?;
+            let (from, first_frame) = (episodes.len(), content.timestamps_s.len());
+            hasher.update(format!("{} {}\n", dataset.info.content_hash, weight / sum));
+            content.append(FrameContent {
+                actions: reordered(&dataset.actions, &dataset.info.action_channels, &first.action_channels),
+                states: reordered(&dataset.states, &dataset.info.state_channels, &first.state_channels),
+                timestamps_s: dataset.timestamps_s,
+                ..FrameContent::default()
+            });
+            episodes.extend(dataset.episodes.into_iter().map(|episode| Episode {
+                index: from + episode.index,
+                first_frame: first_frame + episode.first_frame,
+                ..episode
+            }));
+            stores.push((first_frame, dataset.images));
+            parts.push(DatasetPart {
+                info: dataset.info,
+                episodes: from..episodes.len(),
+                share: weight / sum,
+            });
+        }
+        let names: Vec<&str> = parts.iter().map(|part| part.info.name.as_str()).collect();
+        let info = DatasetInfo {
+            name: names.join("+"),
+            has_masks: false,
+            camera: first
+                .camera
+                .filter(|camera| parts.iter().all(|part| part.info.camera == Some(*camera))),
+            content_hash: format!("{:x}", hasher.finalize()),
+            frame_count: content.timestamps_s.len(),
+            episode_count: episodes.len(),
+            ..first
+        };
+        Ok(Self {
+            info,
+            parts,
+            episodes,
+            images: FrameStore::Joined(stores),
+            actions: content.actions,
+            states: content.states,
+            timestamps_s: content.timestamps_s,
+        })
+    }
+}
+
+fn check_weights(weighted: &[(Dataset, f64)]) -> Result<(), DatasetError> {
+    if weighted.is_empty() {
+        return Err(DatasetError::Usage(
+            "there is no data set to join; name at least one".to_owned(),
+        ));
+    }
+    for (place, (dataset, weight)) in weighted.iter().enumerate() {
+        let name = &dataset.info.name;
+        if !(weight.is_finite() && *weight > 0.0) {
+            return Err(DatasetError::Usage(format!(
+                "the weight of \"{name}\" is {weight}; it must be above 0"
+            )));
+        }
+        let is_same = |(other, _): &(Dataset, f64)| other.info.content_hash == dataset.info.content_hash;
+        if weighted[..place].iter().any(is_same) {
+            return Err(DatasetError::Usage(format!(
+                "the data set \"{name}\" is named twice; name it once, with a larger weight"
+            )));
+        }
+    }
+    Ok(())
+}
+
+/// Errors: `Usage` if frames of `other` cannot stand beside those of `first`.
+fn check_fit(first: &DatasetInfo, other: &DatasetInfo) -> Result<(), DatasetError> {
+    let size = |info: &DatasetInfo| format!("{}×{} px", info.frame_width_px, info.frame_height_px);
+    if size(first) != size(other) {
+        return Err(DatasetError::Usage(format!(
+            "\"{}\" has frames of {}, and \"{}\" of {}; import or collect it with the same size",
+            first.name,
+            size(first),
+            other.name,
+            size(other)
+        )));
+    }
+    let ratio = first.frame_period_s / other.frame_period_s;
+    if !(1.0 / MAX_PERIOD_RATIO..=MAX_PERIOD_RATIO).contains(&ratio) {
+        return Err(DatasetError::Usage(format!(
+            "\"{}\" has a frame every {} s, and \"{}\" every {} s; import or collect it with the same frame period",
+            first.name, first.frame_period_s, other.name, other.frame_period_s
+        )));
+    }
+    let kinds = [
+        ("action", &first.action_channels, &other.action_channels),
+        ("state", &first.state_channels, &other.state_channels),
+    ];
+    for (kind, expected, found) in kinds {
+        if let Some(missing) = expected.iter().find(|channel| place_of(found, channel).is_none()) {
+            return Err(DatasetError::Usage(format!(
+                "\"{}\" lacks the {kind} channel {missing} of \"{}\"; it has {}",
+                other.name,
+                first.name,
+                if found.is_empty() {
+                    "none".to_owned()
+                } else {
+                    comma_separated(found)
+                }
+            )));
+        }
+    }
+    Ok(())
+}
+
+/// Where a channel of this name and unit stands.
+fn place_of(channels: &[Channel], wanted: &Channel) -> Option<usize> {
+    let is_same = |channel: &Channel| channel.name == wanted.name && channel.unit == wanted.unit;
+    channels.iter().position(is_same)
+}
+
+/// The rows of `values`, whose channels are `found`, with the channels of `expected`.
+fn reordered(values: &[f32], found: &[Channel], expected: &[Channel]) -> Vec<f32> {
+    if expected.is_empty() {
+        return Vec::new();
+    }
+    let places: Vec<usize> = expected.iter().filter_map(|channel| place_of(found, channel)).collect();
+    values
+        .chunks_exact(found.len())
+        .flat_map(|row| places.iter().map(|&place| row[place]))
+        .collect()
+}

@@ -1,0 +1,184 @@
+//! What is fixed before the first step of a training: its windows, the model's description and the manifest.
+
+use super::augment::Augmentation;
+use super::batches::FrameSource;
+use super::config::{TrainConfig, WindowBudget};
+use super::state::TrainState;
+use super::{START_KEY, TrainError, Training};
+use foreframe_core::nn::ModelSpec;
+use foreframe_core::nn::spec::MIN_CHANNEL_STD;
+use foreframe_core::registry::{DatasetShare, DatasetStamp, Manifest, ProgramStamp};
+use foreframe_data::dataset::sampler::{Split, Splits};
+use foreframe_data::dataset::{Dataset, DatasetPart, Window};
+
+/// What is fixed before the first step: the windows and the model specification.
+pub(super) struct TrainingPlan<'a> {
+    pub(super) source: FrameSource<'a>,
+    pub(super) spec: ModelSpec,
+    /// Those of the first part of the data set, then those of the next.
+    pub(super) train: Vec<Window>,
+    pub(super) mixture: Vec<MixturePart>,
+}
+
+/// A part of the data set in the training.
+pub(super) struct MixturePart {
+    pub(super) part: DatasetPart,
+    pub(super) train_windows: usize,
+    pub(super) validation: Vec<Window>,
+}
+
+impl<'a> TrainingPlan<'a> {
+    pub(super) fn new(config: &TrainConfig, dataset: &'a Dataset) -> Result<Self, TrainError> {
+        let shape = config.window_shape();
+        let splits = Splits::new(dataset, config.data.split_seed);
+        let available = splits.windows(dataset, Split::Train, shape, 1)?;
+        let validation = splits.windows(dataset, Split::Validation, shape, 1)?;
+        let mut train = match config.data.windows {
+            WindowBudget::Count(count) if !available.is_empty() => {
+                splits.sample(dataset, Split::Train, shape, count, config.seed.derive("windows", 0))?
+            }
+            _ => available,
+        };
+        let parts = dataset.parts();
+        if parts.len() > 1 {
+            // Stable: within a part, they stay in the order in which they were drawn.
+            train.sort_by_key(|window| parts.iter().position(|part| part.episodes.contains(&window.episode)));
+        }
+        let mut mixture = Vec::new();
+        for part in parts {
+            let of_part = |windows: &[Window]| -> Vec<Window> {
+                let inside = |window: &&Window| part.episodes.contains(&window.episode);
+                windows.iter().filter(inside).copied().collect()
+            };
+            let validation = of_part(&validation);
+            let train_windows = of_part(&train).len();
+            if train_windows == 0 || validation.is_empty() {
+                return Err(TrainError::NoWindows {
+                    dataset: part.info.name.clone(),
+                    train: train_windows,
+                    validation: validation.len(),
+                    frames: shape.frames(),
+                });
+            }
+            let stride = validation.len().div_ceil(config.data.validation_windows).max(1);
+            mixture.push(MixturePart {
+                train_windows,
+                validation: validation.into_iter().step_by(stride).collect(),
+                part,
+            });
+        }
+        let frames = window_frames(&train, shape.context + shape.horizon);
+        let spec = config.model_spec(dataset, &frames);
+        check_actions(config, dataset, &spec)?;
+        spec.validate()?;
+        let augmentation = Augmentation::new(&config.data, dataset, &frames, config.seed)?;
+        Ok(Self {
+            source: FrameSource::new(dataset, spec.preprocess, config.sequence.target, augmentation),
+            spec,
+            train,
+            mixture,
+        })
+    }
+
+    /// The manifest of the trained model. `validation` is the error of each part of the data set.
+    pub(super) fn manifest(
+        &self,
+        training: &Training<'_>,
+        state: &TrainState,
+        validation: &[f64],
+    ) -> Result<Manifest, TrainError> {
+        let (config, info) = (training.config, training.dataset.info());
+        let mut settings = serde_json::to_value(config).map_err(|error| TrainError::Config(error.to_string()))?;
+        if let Some(start) = training.start {
+            settings[START_KEY] = serde_json::json!({
+                "model": start.manifest.name,
+                "version": start.manifest.version,
+                "weights_sha256": start.manifest.weights_sha256,
+            });
+        }
+        Ok(Manifest {
+            name: config.name.clone(),
+            version: 1,
+            spec: self.spec.clone(),
+            weights_sha256: String::new(),
+            dataset: DatasetStamp {
+                name: info.name.clone(),
+                content_hash: info.content_hash.clone(),
+                scenario: info.scenario.clone(),
+                windows: self.train.len(),
+                split_seed: config.data.split_seed,
+                parts: self.shares(),
+            },
+            seed: config.seed,
+            command: training.command.to_owned(),
+            training: settings,
+            metrics: self.metrics(state, validation),
+            calibration: None,
+            parameters: self.spec.parameter_count(),
+            multiply_adds_per_frame: self.spec.multiply_adds_per_frame(),
+            program: ProgramStamp::current(),
+        })
+    }
+
+    /// The number of training windows of each part and its share of what is drawn.
+    pub(super) fn drawn_parts(&self) -> Vec<(usize, f64)> {
+        self.mixture
+            .iter()
+            .map(|part| (part.train_windows, part.part.share))
+            .collect()
+    }
+
+    /// The parts of a joined data set, for the manifest; none if it is not joined.
+    fn shares(&self) -> Vec<DatasetShare> {
+        let share = |part: &MixturePart| DatasetShare {
+            name: part.part.info.name.clone(),
+            content_hash: part.part.info.content_hash.clone(),
+            scenario: part.part.info.scenario.clone(),
+            windows: part.train_windows,
+            share: part.part.share,
+        };
+        let parts = if self.mixture.len() > 1 { &self.mixture[..] } else { &[] };
+        parts.iter().map(share).collect()
+    }
+
+    fn metrics(&self, state: &TrainState, validation: &[f64]) -> serde_json::Value {
+        let progress = &state.progress;
+        let mut metrics = serde_json::json!({
+            "validation": { "mse": progress.best_loss, "step": progress.best_step }
+        });
+        if self.mixture.len() > 1 {
+            let parts = self.mixture.iter().zip(validation);
+            metrics["validation"]["datasets"] = parts
+                .map(|(part, mse)| serde_json::json!({"name": part.part.info.name, "mse": mse}))
+                .collect();
+        }
+        metrics
+    }
+}
+
+/// Errors: `ConstantActions` if the model takes actions that never change, so that it could not learn what they do.
+fn check_actions(config: &TrainConfig, dataset: &Dataset, spec: &ModelSpec) -> Result<(), TrainError> {
+    let never_change =
+        spec.action_inputs().is_some() && spec.actions.iter().all(|action| action.std <= MIN_CHANNEL_STD);
+    if !never_change || config.data.constant_actions {
+        return Ok(());
+    }
+    Err(TrainError::ConstantActions {
+        dataset: dataset.info().name.clone(),
+        has_actions: !spec.actions.is_empty(),
+        conditioning: spec.conditioning,
+    })
+}
+
+/// The distinct frames of windows of `length` frames, in increasing order.
+pub(super) fn window_frames(windows: &[Window], length: usize) -> Vec<usize> {
+    let mut starts: Vec<usize> = windows.iter().map(|window| window.first_frame).collect();
+    starts.sort_unstable();
+    let (mut frames, mut next) = (Vec::new(), 0);
+    for start in starts {
+        // Windows overlap; each frame is listed once.
+        frames.extend(next.max(start)..start + length);
+        next = start + length;
+    }
+    frames
+}
