@@ -137,19 +137,47 @@ pub(in crate::server) fn decode(
         }
         return Frame::new(model_width, model_height, bytes).map_err(refused);
     }
-    let (width, height) = codec::dimensions(&bytes).map_err(refused)?;
-    let Some(way) = input.resize else {
+    check_fit(
+        field,
+        codec::dimensions(&bytes).map_err(refused)?,
+        input.resize,
+        manifest,
+    )?;
+    fit(field, codec::decode(&bytes).map_err(refused)?, input.resize, manifest)
+}
+
+/// Pixels of any size as a frame of the model's size. `way`: how another size is resized; `None` refuses it.
+pub(in crate::server) fn fit(
+    field: &str,
+    frame: Frame,
+    way: Option<Resize>,
+    manifest: &Manifest,
+) -> Result<Frame, ImageError> {
+    check_fit(field, (frame.width(), frame.height()), way, manifest)?;
+    let spec = &manifest.spec;
+    let Some(way) = way else { return Ok(frame) };
+    let resized = resize(&frame, spec.frame_width_px, spec.frame_height_px, way);
+    resized.map_err(|error| ImageError::Refused(format!("{field} is {error}")))
+}
+
+/// Errors: `Refused` if an image of that size cannot become a frame of the model.
+fn check_fit(
+    field: &str,
+    (width, height): (u32, u32),
+    way: Option<Resize>,
+    manifest: &Manifest,
+) -> Result<(), ImageError> {
+    if way.is_none() {
         let checked = check_size(field, manifest, (width, height));
-        checked.map_err(|error| ImageError::Refused(format!("{error}; set resize to crop, letterbox or stretch")))?;
-        return codec::decode(&bytes).map_err(refused);
-    };
+        return checked
+            .map_err(|error| ImageError::Refused(format!("{error}; set resize to crop, letterbox or stretch")));
+    }
     if width.saturating_mul(height) > MAX_FIT_PIXELS {
         return Err(ImageError::Refused(format!(
             "{field} is {width}×{height} px; an image to resize has at most {MAX_FIT_PIXELS} pixels"
         )));
     }
-    let frame = codec::decode(&bytes).map_err(refused)?;
-    resize(&frame, model_width, model_height, way).map_err(refused)
+    Ok(())
 }
 
 /// The frames in that format.

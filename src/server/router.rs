@@ -18,7 +18,7 @@ use super::http::requests;
 use super::openapi;
 use super::routes::{
     audit, datasets, environments, episodes, events, health, inference_protocol, job_events, jobs, metrics, models,
-    pages, predict, preview, rollouts, sessions, streams,
+    openpi, pages, predict, preview, rollouts, sessions, streams,
 };
 use super::state::App;
 
@@ -87,6 +87,7 @@ fn request_routes(config: &ServerConfig) -> OpenApiRouter<App> {
 fn stream_routes() -> OpenApiRouter<App> {
     OpenApiRouter::new()
         .merge(streams::routes())
+        .merge(openpi::routes())
         .merge(job_events::routes())
         .merge(events::routes())
 }

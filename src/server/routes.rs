@@ -11,6 +11,7 @@ pub(super) mod job_events;
 pub(super) mod jobs;
 pub(super) mod metrics;
 pub(super) mod models;
+pub(super) mod openpi;
 pub(super) mod pages;
 pub(super) mod predict;
 pub(super) mod preview;

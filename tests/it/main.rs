@@ -60,6 +60,7 @@ mod nn_optimizer;
 mod nn_reference;
 mod nn_spec;
 #[cfg(feature = "otlp")]
+mod openpi;
 mod otlp;
 mod overload;
 #[cfg(unix)]

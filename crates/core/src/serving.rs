@@ -19,7 +19,7 @@ mod worker;
 pub mod batch;
 pub mod session;
 
-pub use conditioning::{ConditioningInput, RawConditioning, STEP_FIELDS};
+pub use conditioning::{ConditioningInput, FieldNames, OBSERVATION_FIELDS, RawConditioning, STEP_FIELDS};
 pub use error::{InputError, ServingError};
 pub use input::PredictionInput;
 pub use local::{Session, predict};

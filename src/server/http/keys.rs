@@ -26,6 +26,8 @@ use foreframe_jobs::store::{Author, KeyRow, KeyScope, Store, StoreError};
 const PREFIX: &str = "ffk";
 /// A browser cannot set headers of a WebSocket. It can offer the key as a sub-protocol with this prefix.
 const SUBPROTOCOL_PREFIX: &str = "foreframe.key.";
+/// `Api-Key` is what openpi's clients send.
+const SCHEMES: [&str; 2] = ["bearer", "api-key"];
 const ID_BYTES: usize = 6;
 const SECRET_BYTES: usize = 32;
 
@@ -224,6 +226,12 @@ impl Keys {
         self.is_required || self.known.borrow().exist
     }
 
+    /// As [`Keys::check`], with the key that a request presents; counts refusals.
+    pub(in crate::server) fn admit(&self, headers: &HeaderMap, needed: KeyScope) -> Result<(Caller, Author), ApiError> {
+        let checked = self.check(presented(headers), needed);
+        checked.inspect_err(|_| counter!(metric_names::AUTH_REFUSED).increment(1))
+    }
+
     /// Who calls, with a key of the needed scope, and the author of what the request changes. Takes the same time for every unknown
     /// key: the whole text is hashed, then looked up.
     fn check(&self, presented: Option<&str>, needed: KeyScope) -> Result<(Caller, Author), ApiError> {
@@ -255,8 +263,7 @@ pub(in crate::server) async fn check(
     next: Next,
 ) -> Result<Response, ApiError> {
     let needed = required_scope(request.method(), route(&request));
-    let checked = keys.check(presented(request.headers()), needed);
-    let (caller, author) = checked.inspect_err(|_| counter!(metric_names::AUTH_REFUSED).increment(1))?;
+    let (caller, author) = keys.admit(request.headers(), needed)?;
     request.extensions_mut().insert(caller);
     request.extensions_mut().insert(author);
     Ok(next.run(request).await)
@@ -266,7 +273,7 @@ pub(in crate::server) async fn check(
 fn presented(headers: &HeaderMap) -> Option<&str> {
     let bearer = headers.get(header::AUTHORIZATION).and_then(|value| value.to_str().ok());
     let bearer = bearer.and_then(|value| value.split_once(' '));
-    let bearer = bearer.filter(|(scheme, _)| scheme.eq_ignore_ascii_case("bearer"));
+    let bearer = bearer.filter(|(scheme, _)| SCHEMES.iter().any(|known| scheme.eq_ignore_ascii_case(known)));
     let protocols = headers.get(header::SEC_WEBSOCKET_PROTOCOL);
     let protocols = protocols.and_then(|value| value.to_str().ok()).unwrap_or("");
     let mut offered = protocols.split(',').map(str::trim);
@@ -298,6 +305,7 @@ mod tests {
     fn a_key_is_found_in_either_header() {
         let with = |name, value| HeaderMap::from_iter([(name, HeaderValue::from_static(value))]);
         assert_eq!(presented(&with(header::AUTHORIZATION, "bearer abc")), Some("abc"));
+        assert_eq!(presented(&with(header::AUTHORIZATION, "Api-Key abc")), Some("abc"));
         assert_eq!(presented(&with(header::AUTHORIZATION, "Basic abc")), None);
         let offered = "foreframe.v1.json, foreframe.key.abc";
         assert_eq!(presented(&with(header::SEC_WEBSOCKET_PROTOCOL, offered)), Some("abc"));

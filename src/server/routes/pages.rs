@@ -5,7 +5,7 @@
 
 use std::sync::Arc;
 
-use axum::http::{HeaderValue, header};
+use axum::http::{HeaderMap, HeaderValue, header};
 use axum::middleware::map_response;
 use axum::response::{Html, IntoResponse, Response};
 use axum::routing::get;
@@ -14,6 +14,9 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 use utoipa_swagger_ui::{Config, SwaggerUi};
 
+use super::openpi;
+use super::streams::{Messages, Upgrade};
+use crate::server::http::problem::ApiError;
 use crate::server::state::App;
 
 const PAGE: &str = include_str!("../page/index.html");
@@ -93,13 +96,16 @@ pub(in crate::server) fn docs() -> Router<App> {
     }))
 }
 
-/// A page for people.
+/// A page for people. A WebSocket handshake here opens the socket of openpi's clients instead, because they know no path.
 #[utoipa::path(
     get, path = "/", tag = "about",
     responses((status = 200, description = "A page", content_type = "text/html"))
 )]
-async fn page() -> impl IntoResponse {
-    ([(header::CONTENT_SECURITY_POLICY, PAGE_POLICY)], Html(PAGE))
+async fn page(app: App, headers: HeaderMap, messages: Messages, upgrade: Upgrade) -> Result<Response, ApiError> {
+    match upgrade {
+        Ok(upgrade) => openpi::open_at_root(&app, &headers, messages, upgrade),
+        Err(_) => Ok(([(header::CONTENT_SECURITY_POLICY, PAGE_POLICY)], Html(PAGE)).into_response()),
+    }
 }
 
 /// The OpenAPI document as text; clones share it.

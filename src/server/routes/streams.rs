@@ -7,6 +7,7 @@ use axum::Extension;
 use axum::extract::ws::WebSocketUpgrade;
 use axum::extract::ws::rejection::WebSocketUpgradeRejection;
 use axum::response::Response;
+use tokio::sync::OwnedSemaphorePermit;
 use tracing::{Instrument, Span};
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
@@ -17,9 +18,10 @@ use crate::server::http::keys::Caller;
 use crate::server::http::message_bytes::{MessageBytes, UNCOUNTED_BYTES};
 use crate::server::http::problem::ApiError;
 use crate::server::state::App;
-use crate::server::stream::connection::{StreamConnection, StreamServices};
+use crate::server::stream::connection::StreamConnection;
 use crate::server::stream::protocol::{Codec, SessionSettings};
 use crate::server::stream::session::Session;
+use crate::server::stream::socket::StreamServices;
 use foreframe_core::serving::SessionState;
 
 pub(in crate::server) fn routes() -> OpenApiRouter<App> {
@@ -32,9 +34,10 @@ pub(in crate::server) fn routes() -> OpenApiRouter<App> {
 /// longest message.
 const READ_BYTES: usize = UNCOUNTED_BYTES;
 
-type Upgrade = Result<WebSocketUpgrade, WebSocketUpgradeRejection>;
+/// Whether the request is a WebSocket handshake.
+pub(super) type Upgrade = Result<WebSocketUpgrade, WebSocketUpgradeRejection>;
 /// Absent for a request that came over no connection; it cannot be upgraded.
-type Messages = Option<Extension<MessageBytes>>;
+pub(super) type Messages = Option<Extension<MessageBytes>>;
 
 /// Opens the stream of a session: a WebSocket that takes frames with action and state, and answers each with the predicted
 /// frames. Sub-protocols: `foreframe.v1.json` and `foreframe.v1.msgpack`; `/asyncapi.yaml` describes the messages. If the
@@ -90,7 +93,7 @@ async fn model_stream(
     open(&app, services, Arc::new(session), false, upgrade)
 }
 
-fn services(app: &App, caller: Caller, messages: Messages) -> StreamServices {
+pub(super) fn services(app: &App, caller: Caller, messages: Messages) -> StreamServices {
     StreamServices {
         config: Arc::clone(&app.config),
         predictor: app.predictor().clone(),
@@ -120,13 +123,7 @@ fn open(
             Codec::NAMES.join(" and ")
         )));
     }
-    let place = app.streams.enter()?;
-    let limit = app.config().max_body_bytes;
-    let upgrade = upgrade
-        .max_message_size(limit)
-        .max_frame_size(limit)
-        .read_buffer_size(READ_BYTES);
-    services.messages.begin(&app.body_budget);
+    let (place, upgrade) = admit(app, &services, upgrade)?;
     Ok(upgrade.on_upgrade(move |socket| {
         let connection = StreamConnection::new(services, &session, is_persistent, chosen.unwrap_or_default());
         async move {
@@ -135,4 +132,20 @@ fn open(
         }
         .instrument(Span::current())
     }))
+}
+
+/// A place among the streams, and the handshake with the limits of their messages. Errors: `Unavailable`.
+pub(super) fn admit(
+    app: &App,
+    services: &StreamServices,
+    upgrade: WebSocketUpgrade,
+) -> Result<(OwnedSemaphorePermit, WebSocketUpgrade), ApiError> {
+    let place = app.streams.enter()?;
+    let limit = app.config().max_body_bytes;
+    services.messages.begin(&app.body_budget);
+    let upgrade = upgrade
+        .max_message_size(limit)
+        .max_frame_size(limit)
+        .read_buffer_size(READ_BYTES);
+    Ok((place, upgrade))
 }

@@ -5,14 +5,13 @@ use std::fmt::Display;
 use std::sync::Arc;
 use std::time::Duration;
 
-use axum::extract::ws::{CloseFrame, Message, WebSocket, close_code};
+use axum::extract::ws::{CloseFrame, Message, WebSocket};
 use futures_util::stream::{SplitSink, SplitStream};
 use futures_util::{FutureExt as _, SinkExt as _, StreamExt as _};
 use metrics::{Counter, counter};
 use tokio::sync::mpsc;
-use tokio::time::{Instant, timeout, timeout_at};
+use tokio::time::{Instant, timeout};
 use tracing::{debug, info, trace};
-use tungstenite::error::ProtocolError;
 
 use super::outbox::Outbox;
 use super::protocol::{
@@ -20,21 +19,13 @@ use super::protocol::{
     WarningCode,
 };
 use super::session::{Owner, Ownership, Session};
+use super::socket::{ClientGone, InputEnd, StreamServices, arrival, code_of, discard_input, send};
 use super::step::{FrameStep, StepError};
-use crate::server::blocking::BlockingWork;
-use crate::server::config::ServerConfig;
-use crate::server::http::body_budget;
-use crate::server::http::keys::{Caller, Keys};
-use crate::server::http::message_bytes::MessageBytes;
-use crate::server::http::task_limit::{TaskLimit, stop_requested};
+use crate::server::http::task_limit::stop_requested;
 use crate::server::images::ImageFormat;
 use foreframe_core::error_text::without_middle;
 use foreframe_core::frame::resize::Resize;
 use foreframe_core::metric_names;
-use foreframe_core::serving::Predictor;
-
-/// How long a client may take to close the socket after the last message, so that it can read it.
-const LINGER: Duration = Duration::from_secs(1);
 
 /// A message that is answered in the order in which it came.
 enum PipelinedItem {
@@ -48,31 +39,6 @@ impl PipelinedItem {
     fn refused(code: ErrorCode, detail: &dyn Display) -> Self {
         Self::Refused(code, without_middle(detail))
     }
-}
-
-/// Why no message comes any more.
-enum InputEnd {
-    Gone,
-    /// No message for too long.
-    Idle,
-    /// Bytes that are not a WebSocket message; nothing after them can be read.
-    Unreadable(ClosingReason, ErrorCode, String),
-}
-
-/// The client has closed the connection: nothing can be sent any more.
-struct ClientGone;
-
-/// What a stream needs of the server.
-pub(in crate::server) struct StreamServices {
-    pub(in crate::server) config: Arc<ServerConfig>,
-    pub(in crate::server) predictor: Predictor,
-    pub(in crate::server) blocking: BlockingWork,
-    pub(in crate::server) streams: TaskLimit,
-    pub(in crate::server) keys: Keys,
-    /// Who opened the stream.
-    pub(in crate::server) caller: Caller,
-    /// Counts the bytes that the connection receives.
-    pub(in crate::server) messages: MessageBytes,
 }
 
 pub(in crate::server) struct StreamConnection {
@@ -222,32 +188,16 @@ impl StreamConnection {
         let mut idle_since = Instant::now();
         loop {
             let wait = if is_warned { 4 * quarter } else { 3 * quarter };
-            match timeout_at(idle_since + wait, stream.next()).await {
-                Ok(Some(Ok(message @ (Message::Text(_) | Message::Binary(_))))) => {
-                    return Ok(message);
-                }
-                // The WebSocket library answers these; they show that the client is there, and do not extend the time for a
-                // message that has begun.
-                Ok(Some(Ok(Message::Ping(content) | Message::Pong(content)))) => {
-                    self.services.messages.control_read(content.len());
-                    if !self.services.messages.is_unfinished() {
-                        (is_warned, idle_since) = (false, Instant::now());
-                    }
-                }
-                Ok(None) => return Err(InputEnd::Gone),
-                Ok(Some(Ok(Message::Close(_)))) => {
-                    // The library answers a close with the next read.
-                    discard_input(stream).await;
-                    return Err(InputEnd::Gone);
-                }
-                Ok(Some(Err(error))) => return Err(unreadable(error)),
-                Err(_) if is_warned => return Err(InputEnd::Idle),
-                Err(_) => {
+            match arrival(stream, &self.services.messages, idle_since + wait).await {
+                Ok(Some(message)) => return Ok(message),
+                Ok(None) => (is_warned, idle_since) = (false, Instant::now()),
+                Err(InputEnd::Idle) if !is_warned => {
                     is_warned = true;
                     let detail = format!("no message came; in {} ms the stream is closed", quarter.as_millis());
                     let code = WarningCode::Idle;
                     self.outbox.push(ServerMessage::Warning { code, detail }).await;
                 }
+                Err(end) => return Err(end),
             }
         }
     }
@@ -324,47 +274,5 @@ impl StreamConnection {
                 return send(sink, Message::Close(Some(CloseFrame { code, reason })), limit).await;
             }
         }
-    }
-}
-
-/// Why the bytes could not be read.
-fn unreadable(error: axum::Error) -> InputEnd {
-    let error = error.into_inner();
-    if let Some(exceeded) = body_budget::cause(error.as_ref()) {
-        let (reason, code) = (ClosingReason::Overloaded, ErrorCode::Overloaded);
-        return InputEnd::Unreadable(reason, code, exceeded.to_string());
-    }
-    let reason = match error.downcast_ref::<tungstenite::Error>() {
-        Some(tungstenite::Error::Capacity(_)) => ClosingReason::TooLong,
-        Some(tungstenite::Error::Utf8(_)) => ClosingReason::NotUtf8,
-        Some(tungstenite::Error::Protocol(ProtocolError::ResetWithoutClosingHandshake)) => return InputEnd::Gone,
-        Some(tungstenite::Error::Protocol(_)) => ClosingReason::Malformed,
-        _ => return InputEnd::Gone,
-    };
-    InputEnd::Unreadable(reason, ErrorCode::Malformed, error.to_string())
-}
-
-/// Discards input for a moment.
-async fn discard_input(stream: &mut SplitStream<WebSocket>) {
-    let all = async { while let Some(Ok(_)) = stream.next().await {} };
-    // A client that has not closed by then gets no more time.
-    let _ = timeout(LINGER, all).await;
-}
-
-/// Errors: the message cannot be sent within the limit.
-async fn send(sink: &mut SplitSink<WebSocket, Message>, message: Message, limit: Duration) -> Result<(), ClientGone> {
-    let sent = timeout(limit, sink.send(message)).await;
-    sent.map_err(|_| ClientGone)?.map_err(|_| ClientGone)
-}
-
-fn code_of(reason: ClosingReason) -> u16 {
-    match reason {
-        ClosingReason::Asked | ClosingReason::Idle | ClosingReason::Deleted => close_code::NORMAL,
-        ClosingReason::Replaced | ClosingReason::Revoked => close_code::POLICY,
-        ClosingReason::TooLong => close_code::SIZE,
-        ClosingReason::Malformed => close_code::PROTOCOL,
-        ClosingReason::NotUtf8 => close_code::INVALID,
-        ClosingReason::Slow | ClosingReason::Overloaded => close_code::AGAIN,
-        ClosingReason::Shutdown => close_code::AWAY,
     }
 }

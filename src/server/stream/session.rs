@@ -144,7 +144,7 @@ impl Session {
 
 /// A connection's right to step a session, until another connection takes over or this is dropped.
 pub(in crate::server) struct Ownership {
-    pub(super) session: Arc<Session>,
+    pub(in crate::server) session: Arc<Session>,
     number: u64,
     changed: watch::Receiver<Owner>,
 }

@@ -11,7 +11,8 @@ use foreframe_core::frame::resize::Resize;
 use foreframe_core::nn::ModelSpec;
 use foreframe_core::registry::Manifest;
 use foreframe_core::serving::{
-    ConditioningInput, InputError, Prediction, RawConditioning, STEP_FIELDS, ServingError, SessionState, Task,
+    ConditioningInput, FieldNames, InputError, Prediction, RawConditioning, STEP_FIELDS, ServingError, SessionState,
+    Task,
 };
 use foreframe_core::types::{Action, RobotState, ValueError};
 
@@ -35,31 +36,57 @@ impl FrameStep {
         manifest: &Manifest,
         max_steps: usize,
     ) -> Result<Self, StepError> {
-        let limit = max_steps.max(manifest.spec.horizon);
-        if let Some(found) = message.steps.filter(|steps| *steps > limit) {
-            return Err(StepError::Invalid(format!(
-                "steps is {found}; this server predicts 1 to {limit}"
-            )));
-        }
-        let past: Option<Action> = message.action.map(|action| checked("action", action)).transpose()?;
-        let actions = |plan: Vec<Vec<f32>>| plan.into_iter().map(|action| checked("plan", action)).collect();
-        let plan: Option<Vec<Action>> = message.plan.map(actions).transpose()?;
-        let state: Option<RobotState> = message.state.map(|state| checked("state", state)).transpose()?;
-        let given = RawConditioning {
-            past: past.as_slice(),
-            plan: plan.as_deref(),
-            state: state.as_ref(),
+        let format = message.format;
+        let conditions = StepConditions {
+            action: message.action,
+            plan: message.plan,
+            state: message.state,
             steps: message.steps,
         };
-        let format = message.format;
         Ok(Self {
             seq: message.seq,
             timestamp_us: message.timestamp_us,
-            conditioning: ConditioningInput::new(given, &STEP_FIELDS, manifest)?,
+            conditioning: conditions.check(&STEP_FIELDS, manifest, max_steps)?,
             frame: images::decode("image", message.image, ImageInput { format, resize }, manifest)?,
             format,
             is_overtaken: false,
         })
+    }
+}
+
+/// What comes with a frame, as the client sent it.
+pub(in crate::server) struct StepConditions {
+    pub(in crate::server) action: Option<Vec<f32>>,
+    pub(in crate::server) plan: Option<Vec<Vec<f32>>>,
+    pub(in crate::server) state: Option<Vec<f32>>,
+    pub(in crate::server) steps: Option<usize>,
+}
+
+impl StepConditions {
+    /// The conditioning input, if it fits the model. `names`: of the fields, for errors.
+    pub(in crate::server) fn check(
+        self,
+        names: &FieldNames,
+        manifest: &Manifest,
+        max_steps: usize,
+    ) -> Result<ConditioningInput, StepError> {
+        let limit = max_steps.max(manifest.spec.horizon);
+        if let Some(found) = self.steps.filter(|steps| *steps > limit) {
+            return Err(StepError::Invalid(format!(
+                "steps is {found}; this server predicts 1 to {limit}"
+            )));
+        }
+        let past: Option<Action> = self.action.map(|action| checked("action", action)).transpose()?;
+        let actions = |plan: Vec<Vec<f32>>| plan.into_iter().map(|action| checked(names.plan, action)).collect();
+        let plan: Option<Vec<Action>> = self.plan.map(actions).transpose()?;
+        let state: Option<RobotState> = self.state.map(|state| checked("state", state)).transpose()?;
+        let given = RawConditioning {
+            past: past.as_slice(),
+            plan: plan.as_deref(),
+            state: state.as_ref(),
+            steps: self.steps,
+        };
+        Ok(ConditioningInput::new(given, names, manifest)?)
     }
 }
 

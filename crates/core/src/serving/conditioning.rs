@@ -32,7 +32,8 @@ pub struct RawConditioning<'a> {
 /// The names of the fields in error messages.
 pub struct FieldNames {
     pub(super) past: fn(usize) -> String,
-    pub(super) plan: &'static str,
+    /// The field of the future actions.
+    pub plan: &'static str,
     pub(super) missing: &'static str,
 }
 
@@ -47,6 +48,11 @@ pub const STEP_FIELDS: FieldNames = FieldNames {
     past: |_| "action".to_owned(),
     plan: "plan",
     missing: "action",
+};
+/// The fields of an observation of openpi's clients.
+pub const OBSERVATION_FIELDS: FieldNames = FieldNames {
+    plan: "actions",
+    ..STEP_FIELDS
 };
 
 impl ConditioningInput {

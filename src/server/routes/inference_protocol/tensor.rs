@@ -1,11 +1,9 @@
 //! Tensors: their types, and their values as JSON and as bytes.
 
-use std::fmt;
-
-use serde::de::{DeserializeSeed, SeqAccess, Visitor};
-use serde::{Deserialize, Deserializer, Serialize};
+use serde::{Deserialize, Serialize};
 
 use crate::server::http::problem::ApiError;
+use crate::server::nested_numbers::NestedNumbers;
 
 /// The types of values that this server takes and gives.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -80,7 +78,7 @@ pub(super) struct InputHead {
     datatype: String,
     #[serde(default)]
     parameters: InputParameters,
-    data: Option<Numbers>,
+    data: Option<NestedNumbers>,
 }
 
 #[derive(Debug, Default, Deserialize)]
@@ -133,7 +131,7 @@ impl Tensor {
         };
         let wrong = |found: usize| refused(format!("holds {found} values; its shape {:?} has {count}", head.shape));
         let (values, rest) = match (head.data, head.parameters.binary_data_size) {
-            (Some(Numbers(numbers)), None) => {
+            (Some(NestedNumbers { values: numbers, .. }), None) => {
                 if numbers.len() != count {
                     return Err(wrong(numbers.len()));
                 }
@@ -206,56 +204,5 @@ fn from_bytes(datatype: Datatype, bytes: &[u8]) -> Values {
             let (words, _) = bytes.as_chunks::<4>();
             Values::Fp32(words.iter().map(|word| f32::from_le_bytes(*word)).collect())
         }
-    }
-}
-
-/// The numbers of a list that may be nested, in order.
-#[derive(Debug)]
-struct Numbers(Vec<f32>);
-
-impl<'de> Deserialize<'de> for Numbers {
-    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        let mut numbers = Vec::new();
-        Element(&mut numbers).deserialize(deserializer)?;
-        Ok(Self(numbers))
-    }
-}
-
-/// A number, or a list of elements.
-struct Element<'a>(&'a mut Vec<f32>);
-
-impl<'de> DeserializeSeed<'de> for Element<'_> {
-    type Value = ();
-
-    fn deserialize<D: Deserializer<'de>>(self, deserializer: D) -> Result<(), D::Error> {
-        deserializer.deserialize_any(self)
-    }
-}
-
-impl<'de> Visitor<'de> for Element<'_> {
-    type Value = ();
-
-    fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str("numbers in lists")
-    }
-
-    fn visit_f64<E>(self, value: f64) -> Result<(), E> {
-        self.0.push(value as f32);
-        Ok(())
-    }
-
-    fn visit_i64<E>(self, value: i64) -> Result<(), E> {
-        self.0.push(value as f32);
-        Ok(())
-    }
-
-    fn visit_u64<E>(self, value: u64) -> Result<(), E> {
-        self.0.push(value as f32);
-        Ok(())
-    }
-
-    fn visit_seq<A: SeqAccess<'de>>(self, mut items: A) -> Result<(), A::Error> {
-        while items.next_element_seed(Element(&mut *self.0))?.is_some() {}
-        Ok(())
     }
 }

@@ -1,0 +1,116 @@
+//! An observation of openpi's client, and the step of a session that it becomes.
+
+use serde::Deserialize;
+
+use super::numpy::ReceivedArray;
+use crate::server::images::{self, ImageFormat};
+use crate::server::stream::step::{FrameStep, StepConditions, StepError};
+use foreframe_core::frame::Frame;
+use foreframe_core::frame::codec::gray_from_rgb;
+use foreframe_core::frame::resize::Resize;
+use foreframe_core::registry::Manifest;
+use foreframe_core::serving::OBSERVATION_FIELDS;
+
+/// What a client sends with `infer`.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct OpenpiObservation {
+    /// What to do; without it, predict.
+    #[serde(default)]
+    pub(super) endpoint: Endpoint,
+    /// The model; another one than before begins a new context. Without it, the model stays.
+    pub(super) model: Option<String>,
+    /// Begins a new context with this frame.
+    #[serde(default)]
+    pub(super) reset: bool,
+    /// `[height, width]`, `[height, width, 1]` (gray) or `[height, width, 3]` (red, green, blue), uint8.
+    frame: Option<ReceivedArray>,
+    /// How a frame of another size is resized; without it, another size is refused.
+    resize: Option<Resize>,
+    /// The robot's state at this frame.
+    state: Option<ReceivedArray>,
+    /// The action from this frame to the next.
+    action: Option<ReceivedArray>,
+    /// The future actions, `[steps, channels]`. Without them, `action` is repeated.
+    actions: Option<ReceivedArray>,
+    /// How many frames to predict. Default: the model's horizon.
+    steps: Option<usize>,
+}
+
+/// What a message asks for, in the words of other servers of openpi's protocol.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub(super) enum Endpoint {
+    #[default]
+    Infer,
+    /// Begins a new context; needs no frame.
+    Reset,
+}
+
+impl OpenpiObservation {
+    /// The step of number `seq`. Errors name the key.
+    pub(super) fn into_step(self, seq: u64, manifest: &Manifest, max_steps: usize) -> Result<FrameStep, StepError> {
+        let conditions = StepConditions {
+            action: self.action.map(|array| vector("action", array)).transpose()?,
+            plan: self.actions.map(|array| rows("actions", array)).transpose()?,
+            state: self.state.map(|array| vector("state", array)).transpose()?,
+            steps: self.steps,
+        };
+        let frame = self.frame.ok_or_else(|| {
+            let reason = "frame is missing; it is an array uint8 [height, width] or [height, width, 3]";
+            StepError::Invalid(reason.to_owned())
+        })?;
+        Ok(FrameStep {
+            seq,
+            timestamp_us: 0,
+            conditioning: conditions.check(&OBSERVATION_FIELDS, manifest, max_steps)?,
+            frame: images::fit("frame", image(frame)?, self.resize, manifest)?,
+            format: ImageFormat::Raw,
+            is_overtaken: false,
+        })
+    }
+}
+
+fn wrong(key: &str, reason: &str) -> StepError {
+    StepError::Invalid(format!("{key} {reason}"))
+}
+
+/// A gray image.
+fn image(array: ReceivedArray) -> Result<Frame, StepError> {
+    let shape = array.shape.clone();
+    let (height, width, is_color) = match shape.as_slice() {
+        [height, width] | [height, width, 1] => (*height, *width, false),
+        [height, width, 3] => (*height, *width, true),
+        _ => {
+            let reason =
+                format!("has the shape {shape:?}; it is [height, width], also with 1 or 3 channels at the end");
+            return Err(wrong("frame", &reason));
+        }
+    };
+    let pixels = array.bytes().map_err(|reason| wrong("frame", &reason))?;
+    let pixels = if is_color { gray_from_rgb(&pixels) } else { pixels };
+    let side = |side: usize| u32::try_from(side).unwrap_or(u32::MAX);
+    let frame = Frame::new(side(width), side(height), pixels);
+    frame.map_err(|error| wrong("frame", &format!("is {error}")))
+}
+
+/// The numbers of one row.
+fn vector(key: &str, array: ReceivedArray) -> Result<Vec<f32>, StepError> {
+    let rows = array.shape.iter().rev().skip(1);
+    if rows.clone().any(|side| *side != 1) {
+        let reason = format!("has the shape {:?}; it is one row of numbers", array.shape);
+        return Err(wrong(key, &reason));
+    }
+    array.numbers().map_err(|reason| wrong(key, &reason))
+}
+
+/// The numbers of each row.
+fn rows(key: &str, array: ReceivedArray) -> Result<Vec<Vec<f32>>, StepError> {
+    let (shape, count) = (array.shape.clone(), array.shape.len());
+    if count < 2 || shape[..count - 2].iter().any(|side| *side != 1) {
+        return Err(wrong(key, &format!("has the shape {shape:?}; it is [steps, channels]")));
+    }
+    let numbers = array.numbers().map_err(|reason| wrong(key, &reason))?;
+    let length = shape[count - 1].max(1);
+    Ok(numbers.chunks(length).map(<[f32]>::to_vec).collect())
+}
