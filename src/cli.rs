@@ -2,7 +2,7 @@
 //! carried out as it was given. Exit code 1: it failed. Exit code 130: it was interrupted.
 //!
 //! Subcommands do not use each other. What they share is, in the order in which it may use each other: `error`, `process` and
-//! `progress`, `interrupt`, `settings`, `output`, `admin_address`, `workspace`.
+//! `progress`, `interrupt`, `table`, `scores`, `settings`, `output`, `admin_address`, `workspace`.
 
 mod admin_address;
 mod backup;
@@ -23,8 +23,10 @@ mod predict;
 mod process;
 mod progress;
 mod publish;
+mod scores;
 mod serve;
 mod settings;
+mod table;
 mod train;
 mod worker;
 mod workspace;

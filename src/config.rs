@@ -187,6 +187,14 @@ impl LoadedConfig {
         let entry = |field| print::entry(&self.values, field, &meanings);
         fields.keys().map(|field| entry(field)).collect::<Vec<_>>().join("\n")
     }
+
+    /// The settings as a JSON object, each with its value and origin; passwords in URLs are hidden.
+    #[must_use]
+    pub fn to_json(&self) -> serde_json::Value {
+        let fields = defaults();
+        let entry = |field: &str| (field.to_owned(), print::json_entry(&self.values, field));
+        fields.keys().map(|field| entry(field)).collect()
+    }
 }
 
 /// Every setting with its default.

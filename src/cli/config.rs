@@ -15,10 +15,17 @@ use super::settings::ServerArgs;
   foreframe config --set drain_ms=2000 > foreframe.toml
   FOREFRAME_MAX_STREAMS=8 foreframe config")]
 pub(super) struct ConfigArgs {
+    /// Print JSON instead of a configuration file
+    #[arg(long)]
+    json: bool,
     #[command(flatten)]
     settings: ServerArgs,
 }
 
 pub(super) fn run(args: &ConfigArgs) -> Result<(), CliError> {
-    print_line(args.settings.load()?.to_toml().trim_end())
+    let loaded = args.settings.load()?;
+    if args.json {
+        return print_line(serde_json::to_string_pretty(&loaded.to_json()).map_err(CliError::failed)?);
+    }
+    print_line(loaded.to_toml().trim_end())
 }

@@ -1,13 +1,16 @@
 //! `foreframe evaluate`
 
-use std::path::PathBuf;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
 
 use clap::value_parser;
+use serde_json::{Value, json};
 
 use super::error::CliError;
 use super::output::OutputDirectory;
 use super::process::{command_line, print_line};
 use super::progress::ProgressLine;
+use super::scores::print_scores;
 use super::settings::CommonArgs;
 use super::workspace::{Workspace, trained_on};
 use foreframe_core::registry::{self, Model};
@@ -15,6 +18,9 @@ use foreframe_core::types::Seed;
 use foreframe_data::dataset::Dataset;
 use foreframe_jobs::jobs::spec::MAX_RESAMPLES;
 use foreframe_train::evaluation::{self, EvaluateConfig, EvaluationReport, NEAREST_WINDOWS, ScoredSplit};
+
+/// The page that `--html` adds to the report.
+const PAGE: &str = "report.html";
 
 /// Measure a model on data that training never saw, and write a report with figures and a GIF.
 ///
@@ -24,7 +30,7 @@ use foreframe_train::evaluation::{self, EvaluateConfig, EvaluationReport, NEARES
 /// validation`; the test sets are for the final numbers.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
-  foreframe evaluate --model paper --dataset static-observer
+  foreframe evaluate --model paper --dataset static-observer --html
   foreframe evaluate --model runs/moving/model --twin runs/plain/model --out reports/moving
   foreframe evaluate --model mine@2 --dataset small --data-dir /var/lib/foreframe
   foreframe evaluate --model runs/moving-mnist/model --dataset mnist-test-seq --split all")]
@@ -69,6 +75,12 @@ pub(super) struct EvaluateArgs {
     /// Also write the scores into the model's manifest; scores of other splits in it are kept
     #[arg(long)]
     save_scores: bool,
+    /// Also write the report with its figures as one page, report.html
+    #[arg(long)]
+    html: bool,
+    /// Print the scores as JSON instead of a table
+    #[arg(long)]
+    json: bool,
     #[command(flatten)]
     settings: CommonArgs,
 }
@@ -137,6 +149,9 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<(), CliError> {
     progress.finish();
     let figures = evaluation::draw_figures(&loaded, &dataset, &report)?;
     evaluation::write(output.path(), &mut report, &figures)?;
+    if args.html {
+        output.write(PAGE, evaluation::html_page(&report, &figures).as_bytes())?;
+    }
     output.finish()?;
     if args.save_scores {
         let mut scores = report.headline();
@@ -149,14 +164,43 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<(), CliError> {
         }
         registry::record_metrics(&model_dir, scores)?;
     }
-    for (split, score) in report.headline().as_object().into_iter().flatten() {
-        print_line(format!("{split}: {score}"))?;
+    if args.json {
+        print_line(as_json(&report, &out))?;
+    } else {
+        print_summary(&report, &out, args.html)?;
+    }
+    args.min_skill.map_or(Ok(()), |least| require_skill(&report, least))
+}
+
+/// The scores in a table, what they say, and where the report is.
+fn print_summary(report: &EvaluationReport, out: &Path, has_page: bool) -> Result<(), CliError> {
+    print_scores(&report.headline(), "")?;
+    for (set, verdict) in verdicts(report) {
+        print_line(format!("{set}: {verdict}"))?;
     }
     for other in &report.novelty {
         print_line(format!("novelty of {}: AUROC {:.3}", other.dataset, other.auroc))?;
     }
-    print_line(out.join("report.md").display())?;
-    args.min_skill.map_or(Ok(()), |least| require_skill(&report, least))
+    let file = if has_page { PAGE } else { "report.md" };
+    print_line(format!("report: {}", out.join(file).display()))
+}
+
+/// What the scores of each set say.
+fn verdicts(report: &EvaluationReport) -> impl Iterator<Item = (&str, String)> {
+    let sets = report.sets.iter();
+    sets.filter_map(|set| Some((set.split.as_str(), set.outcome.scores()?.verdict())))
+}
+
+/// The same for programs, in one line.
+fn as_json(report: &EvaluationReport, out: &Path) -> Value {
+    json!({
+        "model": report.stamp.model,
+        "dataset": report.stamp.dataset,
+        "sets": report.headline(),
+        "verdicts": verdicts(report).collect::<BTreeMap<_, _>>(),
+        "novelty": report.novelty,
+        "report": out.join("report.json"),
+    })
 }
 
 /// Errors: `Failed` with the first set whose skill is lower.

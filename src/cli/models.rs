@@ -1,10 +1,15 @@
 //! `foreframe models`
 
+use std::path::PathBuf;
+
+use serde::Serialize;
+
 use super::error::CliError;
 use super::process::print_line;
 use super::settings::{CommonArgs, with_checked_directories};
 use super::workspace::{Workspace, block_on, split_version};
 use foreframe_core::registry;
+use foreframe_core::types::ModelName;
 use foreframe_jobs::versions::Versions;
 
 /// List, activate and remove versions of models.
@@ -26,8 +31,14 @@ pub(super) struct ModelsArgs {
 #[derive(clap::Subcommand)]
 enum ModelsCommand {
     /// List every version of every model, which one is active, and its directory
-    #[command(after_help = "Example:\n  foreframe models list --data-dir /var/lib/foreframe")]
-    List,
+    #[command(
+        after_help = "Examples:\n  foreframe models list --data-dir /var/lib/foreframe\n  foreframe models list --json"
+    )]
+    List {
+        /// Print JSON instead of text
+        #[arg(long)]
+        json: bool,
+    },
     /// Make a version the active one: running servers of the same store load it within seconds
     #[command(after_help = "Example:\n  foreframe models activate moving@1")]
     Activate {
@@ -50,34 +61,59 @@ pub(super) fn run(args: &ModelsArgs) -> Result<(), CliError> {
     block_on(async {
         let versions = workspace.versions().await?;
         match &args.action {
-            ModelsCommand::List => list(&workspace, &versions).await,
+            ModelsCommand::List { json } => list(&workspace, &versions, *json).await,
             ModelsCommand::Activate { version } => activate(&versions, version).await,
             ModelsCommand::Remove { model } => remove(&versions, model).await,
         }
     })
 }
 
-async fn list(workspace: &Workspace, versions: &Versions) -> Result<(), CliError> {
+/// A version in the list.
+#[derive(Serialize)]
+struct ListedVersion {
+    name: ModelName,
+    version: u32,
+    /// Whether servers answer with it.
+    active: bool,
+    /// Whether it came with the program.
+    shipped: bool,
+    directory: PathBuf,
+}
+
+async fn list(workspace: &Workspace, versions: &Versions, is_json: bool) -> Result<(), CliError> {
     let server = &workspace.config.server;
-    let all = versions.all().await?;
-    if all.is_empty() {
+    let mut listed = Vec::new();
+    for (name, numbers) in versions.all().await? {
+        let active = versions.active(&name).await?;
+        for version in numbers {
+            let shipped = versions.shipped(&name) == Some(version);
+            let directory = if shipped {
+                server.models_dir.join(&name)
+            } else {
+                server.data_dir.join("models").join(&name).join(version.to_string())
+            };
+            listed.push(ListedVersion {
+                name: name.clone(),
+                version,
+                active: active == Some(version),
+                shipped,
+                directory,
+            });
+        }
+    }
+    if is_json {
+        return print_line(serde_json::to_string_pretty(&listed).map_err(CliError::failed)?);
+    }
+    if listed.is_empty() {
         print_line(format!(
             "there is no model in {} and none was published; `foreframe publish DIR` adds one",
             server.models_dir.display()
         ))?;
     }
-    for (name, numbers) in all {
-        let active = versions.active(&name).await?;
-        for version in numbers {
-            let dir = if versions.shipped(&name) == Some(version) {
-                server.models_dir.join(&name)
-            } else {
-                server.data_dir.join("models").join(&name).join(version.to_string())
-            };
-            let state = if active == Some(version) { "active" } else { "" };
-            let label = format!("{name}@{version}");
-            print_line(format!("{label:24} {state:6} {}", dir.display()))?;
-        }
+    for model in listed {
+        let label = format!("{}@{}", model.name, model.version);
+        let state = if model.active { "active" } else { "" };
+        print_line(format!("{label:24} {state:6} {}", model.directory.display()))?;
     }
     for (path, error) in registry::misnamed(&server.models_dir)? {
         print_line(format!("not used: {}: {error}", path.display()))?;

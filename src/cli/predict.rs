@@ -2,11 +2,13 @@
 
 mod actions;
 mod images;
+mod trust;
 
 use std::path::PathBuf;
 
 use self::actions::ActionsFile;
 use self::images::ImagePaths;
+use self::trust::print_trust;
 use super::error::CliError;
 use super::output::OutputDirectory;
 use super::process::print_line;
@@ -16,7 +18,7 @@ use foreframe_core::error_text;
 use foreframe_core::frame::resize::Resize;
 use foreframe_core::frame::{Frame, FrameError, codec};
 use foreframe_core::nn::ModelSpec;
-use foreframe_core::serving::{self, PredictionInput, Rollout};
+use foreframe_core::serving::{self, PredictionInput};
 use foreframe_core::types::ModelName;
 use foreframe_train::evaluation::figures::{animation, montage};
 
@@ -24,7 +26,7 @@ use foreframe_train::evaluation::figures::{animation, montage};
 ///
 /// Takes the last frames of the directory, as many as the model needs, and predicts what follows. File names are sorted in
 /// natural order: 2.png comes before 10.png. With --at N it predicts what follows frame N instead, and shows the true frames
-/// after N beside the prediction. Writes predicted-1.png and so on, contact-sheet.png and prediction.gif.
+/// after N beside the prediction, and the actual errors. Writes predicted-1.png and so on, contact-sheet.png and prediction.gif.
 #[derive(clap::Args)]
 #[command(
     after_help = "The actions file is JSON. Entry i belongs to image i; there may be more actions than images:
@@ -99,35 +101,12 @@ pub(super) fn run(args: &PredictArgs) -> Result<(), CliError> {
     for warning in input.warnings(&loaded.manifest).map_err(CliError::failed)? {
         print_line(format!("warning: {warning}"))?;
     }
-    print_trust(&rollout, spec.horizon)?;
+    print_trust(&rollout, &selected.truth, spec.horizon)?;
     print_line(format!(
         "{}: {steps} frames predicted after frame {}, contact-sheet.png, prediction.gif",
         args.out.display(),
         selected.last
     ))
-}
-
-/// What is known of the errors of the predicted frames.
-fn print_trust(rollout: &Rollout, horizon: usize) -> Result<(), CliError> {
-    if let Some(novelty) = rollout.novelty {
-        print_line(format!(
-            "novelty {novelty:.2}: {:.0} % of the validation contexts are more like the training data",
-            novelty * 100.0
-        ))?;
-    }
-    for (step, error) in (1..).zip(&rollout.errors) {
-        print_line(format!(
-            "t+{step}: expected MSE {:.5}, 90 % between {:.5} and {:.5}",
-            error.mse, error.low, error.high
-        ))?;
-    }
-    if rollout.frames.len() > horizon {
-        print_line(format!(
-            "from t+{} on, the frames are beyond what the model was trained for",
-            horizon + 1
-        ))?;
-    }
-    Ok(())
 }
 
 /// Reads the frames up to the last that the model sees, and the true frames after it. `spec` has the frames to predict as its

@@ -43,6 +43,15 @@ pub(super) fn entry(values: &LayeredSettings, field: &str, meanings: &HashMap<St
     format!("{meaning}{line}\n")
 }
 
+/// The setting's value with its origin, for programs. A password in a URL is hidden.
+pub(super) fn json_entry(values: &LayeredSettings, field: &str) -> serde_json::Value {
+    let value = values.value(field).map(|value| match value {
+        toml::Value::String(text) => toml::Value::String(masked(&text)),
+        value => value,
+    });
+    serde_json::json!({"value": value, "origin": values.origin(field)})
+}
+
 /// `scheme://user:***@host/…?password=***`
 fn masked(text: &str) -> String {
     let Some((scheme, rest)) = text.split_once("://") else {

@@ -192,6 +192,55 @@ async fn other_units_than_the_models_are_refused() {
     );
 }
 
+/// Runs `predict --model moving-flow` on a directory of frames with the actions of the example; returns what it prints.
+fn predict_frames(frames: &std::path::Path, more: &[&str]) -> String {
+    let dir = tempfile::tempdir().unwrap();
+    let actions = concat!(env!("CARGO_MANIFEST_DIR"), "/examples/frames/actions.json");
+    let frames = frames.to_str().unwrap();
+    let arguments = [
+        "predict",
+        "--model",
+        "moving-flow",
+        "--frames",
+        frames,
+        "--actions",
+        actions,
+        "--out",
+        "out",
+    ];
+    let predicted = output(dir.path(), &[&arguments, more].concat());
+    assert!(predicted.status.success(), "{predicted:?}");
+    text(&predicted.stdout)
+}
+
+#[test]
+fn strange_frames_get_a_warning_and_no_band() {
+    let dir = tempfile::tempdir().unwrap();
+    for index in 0..12_u32 {
+        let pixels = (0..64 * 64).map(|at: u32| ((at + index * 7).wrapping_mul(2_654_435_761) >> 13) as u8);
+        let frame = foreframe_core::frame::Frame::new(64, 64, pixels.collect()).unwrap();
+        let png = foreframe_core::frame::codec::encode_png(&frame).unwrap();
+        std::fs::write(dir.path().join(format!("{index}.png")), png).unwrap();
+    }
+    let printed = predict_frames(dir.path(), &["--at", "9"]);
+    let lines: Vec<&str> = printed.lines().collect();
+    let first_error = lines.iter().position(|line| line.starts_with("t+")).unwrap();
+    let warning = lines[..first_error]
+        .iter()
+        .any(|line| line.starts_with("warning: novelty 1.00: these frames are unlike"));
+    assert!(warning && !printed.contains("90 % between"), "{printed}");
+    // Two true frames follow.
+    assert_eq!(printed.matches(": actual MSE ").count(), 2, "{printed}");
+}
+
+#[test]
+fn the_actual_errors_stand_beside_the_expected_ones() {
+    let examples = concat!(env!("CARGO_MANIFEST_DIR"), "/examples/frames");
+    let printed = predict_frames(examples.as_ref(), &["--at", "9"]);
+    let both = |line: &str| line.contains("expected MSE ") && line.contains("; actual MSE ");
+    assert_eq!(printed.lines().filter(|line| both(line)).count(), 5, "{printed}");
+}
+
 #[test]
 fn a_copied_program_predicts_in_an_empty_directory() {
     let (dir, frames) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());

@@ -523,6 +523,10 @@ fn a_model_has_the_name_of_its_directory() {
         "{text}"
     );
     assert!(succeed(dir.path(), "models list").contains("not used: models/my_robot: "));
+    let listed: Value = serde_json::from_str(&succeed(dir.path(), "models list --json")).unwrap();
+    let expected =
+        json!([{"name": "my-robot", "version": 1, "active": true, "shipped": true, "directory": "models/my-robot"}]);
+    assert_eq!(listed, expected);
 }
 
 #[test]
@@ -571,7 +575,19 @@ fn collect_train_and_evaluate_share_default_directories() {
         dir.path(),
         "evaluate --model runs/paper/model --resamples 100 --windows 5",
     );
-    assert!(scores.ends_with("reports/paper/report.md\n"), "{scores}");
+    assert!(
+        scores.starts_with("set ") && scores.contains("\ntest: worse than the strongest baseline ("),
+        "{scores}"
+    );
+    let printed = succeed(
+        dir.path(),
+        "evaluate --model runs/paper/model --resamples 100 --windows 5 --json --html --out again",
+    );
+    let printed: Value = serde_json::from_str(&printed).unwrap();
+    assert!(printed["sets"]["test"]["skill"].as_f64().unwrap() < 0.0, "{printed}");
+    assert_eq!(printed["report"], "again/report.json");
+    assert!(dir.path().join("again/report.html").is_file());
+    assert!(scores.ends_with("report: reports/paper/report.md\n"), "{scores}");
     let described = succeed(dir.path(), "inspect runs/paper/model");
     for network in ["ConvLSTM (Shi et al. 2015)", "CDNA (Finn et al. 2016)"] {
         assert!(described.contains(network), "{described}");

@@ -251,12 +251,14 @@ fn invalid_directories_are_refused_at_startup() {
 fn the_configuration_is_printed_with_its_sources() {
     let dir = tempfile::tempdir().unwrap();
     std::fs::write(dir.path().join("foreframe.toml"), "max_streams = 7\nmax_batch = 8\n").unwrap();
-    let printed = foreframe(dir.path())
-        .args(["config", "--data-dir", "here"])
-        .env("FOREFRAME_MAX_BATCH", "9")
-        .output()
-        .unwrap();
-    let printed = text(&printed.stdout);
+    let config = |more: &[&str]| {
+        let mut command = foreframe(dir.path());
+        command.args(["config", "--data-dir", "here"]).args(more);
+        text(&command.env("FOREFRAME_MAX_BATCH", "9").output().unwrap().stdout)
+    };
+    let listed: Value = serde_json::from_str(&config(&["--json"])).unwrap();
+    assert_eq!(listed["max_streams"], json!({"value": 7, "origin": "foreframe.toml"}));
+    let printed = config(&[]);
     for line in [
         "# Maximum number of streams; more are refused with 503.",
         "max_streams = 7  # foreframe.toml; 1 to 1000000",

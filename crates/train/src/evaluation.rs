@@ -12,6 +12,7 @@ mod config;
 mod error;
 pub mod figures;
 mod forecast;
+mod html;
 mod inference;
 mod least_squares;
 mod markdown;
@@ -24,6 +25,7 @@ pub mod report;
 mod score;
 pub mod skill;
 pub mod uncertainty;
+mod verdict;
 mod windows;
 
 use std::time::Instant;
@@ -32,6 +34,7 @@ pub use self::calibrate::{calibrate, calibrate_trained};
 pub use self::config::{EvaluateConfig, NEAREST_WINDOWS, ScoredSplit};
 pub use self::error::EvaluationError;
 pub use self::figures::draw_figures;
+pub use self::html::html_page;
 pub use self::output::{prepare, write};
 pub use self::progress::{EvaluationProgress, EvaluationStage};
 pub use self::report::EvaluationReport;
@@ -76,7 +79,11 @@ pub fn run(
         compatible::check_untrained(loaded, dataset)?;
     }
     let splits = config.split.divide(dataset, split_seed);
-    let tests = config.split.splits();
+    let mut tests = config.split.splits();
+    if is_recording(dataset) {
+        // A recording has no starts, goals or gains that could be held out.
+        tests = tests.get(..1).unwrap_or(tests);
+    }
     if tests.iter().all(|&split| splits.episodes(split).is_empty()) {
         return Err(EvaluationError::NothingHeldOut {
             dataset: dataset.info().name.clone(),

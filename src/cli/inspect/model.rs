@@ -4,6 +4,7 @@ use std::path::Path;
 
 use crate::cli::error::CliError;
 use crate::cli::process::print_line;
+use crate::cli::scores::print_scores;
 use foreframe_core::error_text::comma_separated;
 use foreframe_core::nn::{Architecture, ChannelScale, ModelSpec, costs};
 use foreframe_core::registry::Manifest;
@@ -38,8 +39,8 @@ pub(super) fn describe(dir: &Path, manifest: &Manifest, as_json: bool) -> Result
     print_line(format!("  seed        {}", manifest.seed.0))?;
     print_line(format!("  made by     {}", manifest.command))?;
     print_line(format!("  weights     SHA-256 {}", manifest.weights_sha256))?;
-    let metrics = serde_json::to_string_pretty(&manifest.metrics).map_err(CliError::failed)?;
-    print_line(format!("  metrics     {}", metrics.replace('\n', "\n              ")))
+    print_line("  scores")?;
+    print_scores(&manifest.metrics, "    ")
 }
 
 /// The architecture and its sizes.

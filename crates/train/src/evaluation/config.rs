@@ -27,7 +27,7 @@ pub enum ScoredSplit {
 }
 
 impl ScoredSplit {
-    /// The splits that are scored, in the order of the report.
+    /// The splits that are scored, in the order of the report. Of a recording, only the first is.
     #[must_use]
     pub fn splits(self) -> &'static [Split] {
         match self {

@@ -7,7 +7,7 @@ use super::actions::Variant;
 use super::bootstrap::{CONFIDENCE, FEWEST_GROUPS};
 use super::method::Method;
 use super::metrics::PSNR_CAP_DB;
-use super::report::EvaluationReport;
+use super::report::{EvaluationReport, SetScores};
 
 /// Squared errors are shown in this unit.
 const MSE_UNIT: f64 = 1e-4;
@@ -25,11 +25,13 @@ impl EvaluationReport {
         environment.add_filter("set_title", set_title);
         environment.add_filter("method", |method: ViaDeserialize<Method>| method.label());
         environment.add_filter("variant", |variant: ViaDeserialize<Variant>| variant.label());
+        let verdicts = self.sets.iter().map(|set| set.outcome.scores().map(SetScores::verdict));
         let report = Value::from_serialize(self);
         let context = context! {
             psnr_cap_db => PSNR_CAP_DB,
             confidence => CONFIDENCE,
             fewest_groups => FEWEST_GROUPS,
+            verdicts => verdicts.collect::<Vec<_>>(),
             ..report
         };
         environment

@@ -1,0 +1,83 @@
+//! What the scores of a set say, in a sentence.
+
+use super::report::SetScores;
+
+/// What a reader may do about a model that is not better than simple baselines.
+const ADVICE: &str = "more data or a longer training may help";
+
+impl SetScores {
+    /// Whether the model is better than the strongest baseline, by how much, and what to do if it is not.
+    #[doc(hidden)]
+    #[must_use]
+    pub fn verdict(&self) -> String {
+        let (mean, interval) = (self.skill.skill.mean, self.skill.mean_interval);
+        let baseline = format!("the strongest baseline ({})", self.skill.best_mean_baseline.label());
+        let percent = 100.0 * mean.abs();
+        let contains_0 = interval.is_some_and(|interval| (interval.low..=interval.high).contains(&0.0));
+        let verdict = match mean {
+            _ if contains_0 => {
+                format!("about as good as {baseline}: the interval of the skill contains 0; {ADVICE}")
+            }
+            0.0.. => format!("better than {baseline} by {percent:.0} %"),
+            _ => format!("worse than {baseline} by {percent:.0} %; {ADVICE}"),
+        };
+        if self.intervals_are_reliable {
+            return verdict;
+        }
+        format!("{verdict}; {} are too few to be sure", self.groups())
+    }
+
+    /// What the windows come from: `12 trials`, `3 blocks`.
+    fn groups(&self) -> String {
+        let (count, unit) = match (self.trials, self.blocks) {
+            (Some(trials), _) => (trials, "trial"),
+            (None, blocks) => (blocks.unwrap_or(0), "block"),
+        };
+        format!("{count} {unit}{}", if count == 1 { "" } else { "s" })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::evaluation::bootstrap::{Bootstrap, Interval};
+    use foreframe_core::types::Seed;
+
+    fn verdict(mean: f64, interval: Option<(f64, f64)>, is_reliable: bool) -> String {
+        let bootstrap = Bootstrap {
+            samples: 1,
+            seed: Seed(0),
+        };
+        let mut scores = SetScores::new(&[], &[], &bootstrap, true);
+        scores.skill.skill.mean = mean;
+        scores.skill.mean_interval = interval.map(|(low, high)| Interval { low, high });
+        scores.intervals_are_reliable = is_reliable;
+        scores.verdict()
+    }
+
+    #[test]
+    fn a_verdict_follows_from_the_skill_and_its_interval() {
+        for (mean, interval, expected) in [
+            (
+                0.48,
+                (0.44, 0.53),
+                "better than the strongest baseline (copy last frame) by 48 %",
+            ),
+            (
+                -0.15,
+                (-0.2, -0.1),
+                "worse than the strongest baseline (copy last frame) by 15 %; more data or a longer training may help",
+            ),
+            (
+                0.04,
+                (-0.18, 0.28),
+                "about as good as the strongest baseline (copy last frame): the interval of the skill contains 0; more data or \
+                 a longer training may help",
+            ),
+        ] {
+            assert_eq!(verdict(mean, Some(interval), true), expected);
+        }
+        let unsure = verdict(0.5, None, false);
+        assert!(unsure.ends_with("by 50 %; 0 blocks are too few to be sure"), "{unsure}");
+    }
+}
