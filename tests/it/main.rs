@@ -20,6 +20,7 @@ mod damaged_jpegs;
 mod dataset_collect;
 mod dataset_sampler;
 mod deleted_versions;
+mod deployment;
 mod environments;
 mod evaluation;
 mod export_mcap;

@@ -36,7 +36,7 @@ class ApiError(ForeframeError):
 
 
 class Unavailable(ApiError):
-    """The server is busy or stops (503), or a limit of the API key is reached (429)."""
+    """The server is busy or stops (503), a limit of the API key is reached (429), or a load balancer lost its server (502, 504)."""
 
     #: When to try again, in seconds.
     retry_after_s: float = 1.0
@@ -76,9 +76,11 @@ def api_error(status: int, headers: Mapping[str, str], body: bytes) -> ApiError:
         words = (str(problem["detail"]), str(problem["type"]), str(problem["instance"]))
     except (ValueError, KeyError, TypeError):
         words = (body.decode(errors="replace").strip()[:500] or f"HTTP status {status}", "", "")
-    if status not in (429, 503):
+    if status not in (429, 502, 503, 504):
         return ApiError(status, *words)
     error = Unavailable(status, *words)
     retry_after = headers.get("retry-after", "")
-    error.retry_after_s = float(retry_after) if retry_after.isdigit() else 1.0
+    # Another server answers the next request at once.
+    otherwise = 0.0 if status in (502, 504) else 1.0
+    error.retry_after_s = float(retry_after) if retry_after.isdigit() else otherwise
     return error

@@ -233,7 +233,12 @@ class SessionFlow:
         except ConnectionFailed as error:
             raise Broken(str(error)) from error
         self._id, self._token = created["id"], created["token"]
-        yield from self._open_socket()
+        try:
+            yield from self._open_socket()
+        except ApiError as error:
+            if error.status != 404:
+                raise
+            raise Broken("the server that made the session is gone") from error
         self._first_seq = self.next_seq - len(self._context)
         for index, message in enumerate(self._context):
             # Only the last of a full context is predicted from, and nobody reads that.
