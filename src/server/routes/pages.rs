@@ -25,7 +25,7 @@ macro_rules! page_files {
     };
 }
 
-const PAGE_FILES: [(&str, &str); 28] = page_files![
+const PAGE_FILES: [(&str, &str); 29] = page_files![
     "address.js",
     "api.js",
     "app.js",
@@ -35,6 +35,7 @@ const PAGE_FILES: [(&str, &str); 28] = page_files![
     "episode.js",
     "gif.js",
     "gray.js",
+    "import_form.js",
     "job.js",
     "keys.js",
     "models.js",

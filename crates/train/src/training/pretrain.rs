@@ -6,6 +6,7 @@ use super::batches::Shuffle;
 use super::config::TrainConfig;
 use super::stage::{BatchPart, Objective};
 use super::{TrainError, TrainingPlan, window_frames};
+use foreframe_core::frame::Frame;
 use foreframe_core::nn::loss::Loss;
 use foreframe_core::nn::{Network, Parameters};
 
@@ -57,6 +58,10 @@ impl Objective for CodecObjective<'_> {
         let [inputs, targets] = &self.validation;
         let loss = Loss::Mse.between(&self.reconstruct(parameters, inputs)?, targets)?;
         Ok(f64::from(loss.to_scalar::<f32>()?))
+    }
+
+    fn sample(&self, _: &Parameters) -> Result<Option<Frame>, TrainError> {
+        Ok(None)
     }
 }
 
