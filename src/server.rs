@@ -3,7 +3,7 @@
 //!
 //! The rooms in the order in which they may use each other; each uses only those before it:
 //! `config`, `msgpack`, `http` (connections, limits, keys, problem details), `blocking`, `render_cache`, `images`, `stream` (a session and its
-//! WebSocket), `environments`, `inference_statistics`, `state` ([`App`]), `routes` (one resource a file), `openapi`, `router`, `admin` (health checks and metrics on their own
+//! WebSocket), `environments`, `uploads`, `inference_statistics`, `state` ([`App`]), `routes` (one resource a file), `openapi`, `router`, `admin` (health checks and metrics on their own
 //! address), `serve`.
 
 mod admin;
@@ -24,6 +24,7 @@ mod serve;
 mod state;
 mod stream;
 mod token;
+mod uploads;
 
 pub use admin::serve_worker_health;
 pub use config::{ServerConfig, SettingError};

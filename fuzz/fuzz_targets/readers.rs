@@ -8,7 +8,7 @@ use std::sync::atomic::AtomicBool;
 use std::sync::{LazyLock, OnceLock};
 
 use axum::extract::ws::Message;
-use foreframe_data::dataset::import::{DEFAULT_DISK_MIB, ImportConfig, ImportOptions, import};
+use foreframe_data::dataset::import::{DEFAULT_DISK_MIB, DEFAULT_MAX_FILES, ImportConfig, ImportOptions, import};
 use foreframe_data::dataset::{CollectConfig, Dataset, collect, silence_caught_panics};
 use foreframe_core::files::sha256_hex;
 use foreframe_core::frame::codec;
@@ -201,6 +201,7 @@ fn imported(name: &str, bytes: &[u8]) {
                 ..ImportOptions::default()
             },
             disk_mib: DEFAULT_DISK_MIB,
+            max_files: DEFAULT_MAX_FILES,
         };
         let _ = import(&config, &|_| {}, &AtomicBool::new(false));
         let _ = std::fs::remove_dir_all(&config.out);

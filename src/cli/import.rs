@@ -18,8 +18,8 @@ const LISTED_ITEMS: usize = 10;
 /// Turn a recording into a data set.
 ///
 /// SOURCE is a folder of PNG or JPEG images (with or without a CSV file of times, actions and states), a Donkeycar tub, a
-/// `LeRobot` data set, a bag of ROS 2 (.mcap, .db3, or the directory of rosbag2), `NumPy` arrays (.npy, .npz), or a video
-/// (needs ffmpeg). Images become gray and get one size. Gaps in time split episodes. If you stop it, run the same command again:
+/// `LeRobot` data set, a bag of ROS 2 (.mcap, .db3, or the directory of rosbag2), `NumPy` arrays (.npy, .npz), a video
+/// (needs ffmpeg), or an archive of one of these (.zip, .tar, .tar.gz). Images become gray and get one size. Gaps in time split episodes. If you stop it, run the same command again:
 /// it continues.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
@@ -28,12 +28,13 @@ const LISTED_ITEMS: usize = 10;
   foreframe import frames/ --csv log.csv --action speed --action turn --unit turn=rad/s
   foreframe import pusht/ --image front --size 96x96
   foreframe import drive.mcap --image /camera/image_raw --action /cmd_vel --state /odom --rate 10
+  foreframe import walk.zip --rate 10
   foreframe import mnist_test_seq.npy --name mnist-test-seq --rate 10
 then
   foreframe inspect mycar
   foreframe train --preset recording --dataset mycar --set name=mycar")]
 pub(super) struct ImportArgs {
-    /// A folder of images, a Donkeycar tub, a LeRobot data set, a bag of ROS 2, a .npy or .npz file, or a video
+    /// A folder of images, a Donkeycar tub, a LeRobot data set, a bag of ROS 2, a .npy or .npz file, a video, or an archive
     source: PathBuf,
     /// The data set's name [default: the source's name]
     #[arg(long)]
@@ -65,6 +66,7 @@ pub(super) fn run(args: ImportArgs) -> Result<(), CliError> {
             ..args.options
         },
         disk_mib: workspace.config.server.import_disk_mib,
+        max_files: workspace.config.server.max_import_files,
     };
     let was_complete = is_finished(&out);
     let (cancelled, progress) = (interrupt::flag()?, ProgressLine::new("frames"));
@@ -127,6 +129,7 @@ fn name(args: &ImportArgs) -> Result<DatasetName, CliError> {
     }
     let source = args.source.canonicalize().unwrap_or_else(|_| args.source.clone());
     let stem = source.file_stem().unwrap_or_default().to_string_lossy().to_lowercase();
+    let stem = stem.strip_suffix(".tar").unwrap_or(&stem);
     let allowed = |c: char| if c.is_ascii_alphanumeric() { c } else { '-' };
     let name: String = stem.chars().map(allowed).take(64).collect();
     let name = name.trim_matches('-');

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use foreframe_core::nn::spec::MAX_STEPS;
 use foreframe_core::serving::PredictorConfig;
-use foreframe_data::dataset::import::DEFAULT_DISK_MIB;
+use foreframe_data::dataset::import::{DEFAULT_DISK_MIB, DEFAULT_MAX_FILES};
 use foreframe_jobs::jobs::JobLimits;
 use foreframe_jobs::jobs::child::JobProcess;
 use foreframe_jobs::jobs::memory::{self, JobMemory};
@@ -165,9 +165,11 @@ settings! {
     /// next attempt resumes from the last checkpoint. An import reports no progress while it reads the recording: raise this limit
     /// for recordings that take longer.
     job_stall_limit_s: u64 = 7_200, 0..=100_000_000;
-    /// Disk space for the frames of a compressed `.npz` file while they are imported, in MiB. An import that needs more is refused;
-    /// 0 refuses all compressed frames.
+    /// Disk space for what is decompressed while it is imported, in MiB: the files of an archive, or the frames of a `.npz` file. An
+    /// import that needs more is refused; 0 refuses all of them.
     import_disk_mib: u64 = DEFAULT_DISK_MIB, 0..=1 << 30;
+    /// Maximum number of files in an archive that is imported.
+    max_import_files: u64 = DEFAULT_MAX_FILES, 1..=1 << 40;
     /// The program whose `run-job` runs each job in a process of its own; without one, jobs run in this process.
     #[serde(skip)]
     job_program: Option<PathBuf> = None;
@@ -177,6 +179,14 @@ settings! {
     prediction_deadline_ms: u64 = 10_000, 1..=MAX_DEADLINE_MS;
     /// How long a request may take to arrive and be answered, in milliseconds.
     request_deadline_ms: u64 = 30_000, 1..=MAX_DEADLINE_MS;
+    /// Maximum size of a file that is uploaded for an import, in MiB; 0 refuses all uploads.
+    max_upload_mib: u64 = 2048, 0..=1 << 24;
+    /// Maximum number of uploads that are received or wait for the end of their import; more are refused with 503.
+    max_uploads: usize = 16, 1..=10_000;
+    /// How long an upload may take, in milliseconds.
+    upload_deadline_ms: u64 = 3_600_000, 1..=MAX_DEADLINE_MS;
+    /// How long an uploaded file is kept that no import uses, in milliseconds.
+    upload_idle_ms: u64 = 3_600_000, 1..=MAX_DEADLINE_MS;
     /// How long an environment is kept that nobody steps, in milliseconds.
     environment_idle_ms: u64 = 600_000, 1..=MAX_DEADLINE_MS;
     /// At the limit of environments, a new one replaces the one that was idle the longest, if that was idle for at least
@@ -266,6 +276,7 @@ impl ServerConfig {
             },
             import_dir: self.import_dir.clone(),
             import_disk_mib: self.import_disk_mib,
+            max_import_files: self.max_import_files,
         }
     }
 

@@ -18,7 +18,7 @@ use super::http::requests;
 use super::openapi;
 use super::routes::{
     audit, datasets, environments, episodes, events, health, inference_protocol, job_events, jobs, metrics, models,
-    openpi, pages, predict, preview, rollouts, sessions, streams,
+    openpi, pages, predict, preview, rollouts, sessions, streams, uploads,
 };
 use super::state::App;
 
@@ -79,6 +79,7 @@ fn request_routes(config: &ServerConfig) -> OpenApiRouter<App> {
         .merge(datasets::routes())
         .merge(episodes::routes())
         .merge(environments::routes())
+        .merge(uploads::routes())
         .merge(audit::routes())
         .merge(inference_protocol::routes())
 }

@@ -18,6 +18,7 @@ pub(super) mod preview;
 pub(super) mod rollouts;
 pub(super) mod sessions;
 pub(super) mod streams;
+pub(super) mod uploads;
 
 mod bounds;
 mod picture;

@@ -25,6 +25,7 @@ use super::http::tls::ServerTls;
 use super::inference_statistics::InferenceStatistics;
 use super::render_cache::RenderCache;
 use super::stream::session_table::SessionTable;
+use super::uploads::Uploads;
 use foreframe_core::registry::Model;
 use foreframe_core::serving::Predictor;
 use foreframe_jobs::jobs::pipeline::Pipeline;
@@ -74,6 +75,7 @@ pub struct AppState {
     /// The threads for simulations and for what is neither a prediction nor a picture.
     pub(super) blocking: BlockingWork,
     pub(super) environments: Environments,
+    pub(super) uploads: Uploads,
     /// Whether the server is stopping: it still answers, but reports that it is not ready.
     pub(super) draining: Arc<AtomicBool>,
     pub(super) sessions: SessionTable,
@@ -133,6 +135,7 @@ impl App {
                 render_cache: RenderCache::new(&config),
                 blocking: BlockingWork::new("requests", config.request_threads, false),
                 environments: Environments::new(&config),
+                uploads: Uploads::new(&config),
                 draining: Arc::default(),
                 sessions: SessionTable::new(config.max_sessions, Duration::from_millis(config.session_grace_ms)),
                 inference_statistics: InferenceStatistics::default(),
@@ -251,8 +254,8 @@ pub fn start_jobs(
     Jobs::start(store.clone(), config.jobs(), executor, runs_jobs)
 }
 
-/// Loads the versions that were activated on other servers, or that a job published as the first of their name, until the
-/// server stops.
+/// Loads the versions that were activated on other servers, or that a job published as the first of their name, and deletes uploads
+/// whose import has ended, until the server stops.
 async fn follow(app: App) {
     let (mut stopping, mut refused) = (app.streams.stopping(), BTreeSet::new());
     loop {
@@ -263,6 +266,9 @@ async fn follow(app: App) {
         }
         if let Err(error) = app.versions().load_activated(app.predictor(), &mut refused).await {
             warn!(%error, "could not check for newly activated versions");
+        }
+        if let Err(error) = app.uploads.sweep(app.jobs(), app.store().objects()).await {
+            warn!(%error, "could not delete uploads that are no longer needed");
         }
     }
 }

@@ -8,7 +8,9 @@ use foreframe_core::error_text::with_causes;
 use foreframe_core::frame::warp::CameraModel;
 use foreframe_core::frame::{Frame, codec};
 use foreframe_data::dataset::Dataset;
-use foreframe_data::dataset::import::{DEFAULT_DISK_MIB, ImportConfig, ImportError, ImportOptions, Imported, import};
+use foreframe_data::dataset::import::{
+    DEFAULT_DISK_MIB, DEFAULT_MAX_FILES, ImportConfig, ImportError, ImportOptions, Imported, import,
+};
 
 use crate::bag_files::{
     BagMessage, Chunks, camera_info, compressed_image, image, joint_state, mcap, odometry, twist, twist_stamped,
@@ -33,6 +35,7 @@ fn run(source: &Path, out: &Path, options: ImportOptions) -> Result<Imported, Im
         out: out.to_owned(),
         options,
         disk_mib: DEFAULT_DISK_MIB,
+        max_files: DEFAULT_MAX_FILES,
     };
     import(&config, &|_| {}, &AtomicBool::new(false))
 }
@@ -263,6 +266,7 @@ fn a_stopped_import_of_a_bag_continues_to_the_same_bytes() {
             out: dir.path().join(format!("stopped-{stop_after}")),
             options: options(),
             disk_mib: DEFAULT_DISK_MIB,
+            max_files: DEFAULT_MAX_FILES,
         };
         let cancelled = AtomicBool::new(false);
         let stop = |now: foreframe_data::dataset::import::ImportProgress| {

@@ -210,7 +210,7 @@ async fn every_example_of_the_contract_succeeds() {
     // The order of paths lets `/v1/sessions` create what `/v1/sessions/{id}/rollouts` needs.
     for (path, methods) in contract["paths"].as_object().unwrap() {
         let operation = &methods["post"];
-        let Some(content) = operation["requestBody"]["content"].as_object() else {
+        let Some(content) = operation["requestBody"]["content"].get("application/json") else {
             continue;
         };
         let parameters = operation["parameters"].as_array().into_iter().flatten();
@@ -225,7 +225,12 @@ async fn every_example_of_the_contract_succeeds() {
             ("sessions", Some(token)) => format!("{address}?token={token}"),
             _ => address,
         };
-        let answer = post(&app, &address, &content["application/json"]["example"]).await;
+        let ask = async || post(&app, &address, &content["example"]).await;
+        let answer = match path.as_str() {
+            // The data set that it names is being collected by the example before it.
+            "/v1/jobs/estimate" => poll_until(async || Some(ask().await).filter(|answer| answer.status != 422)).await,
+            _ => ask().await,
+        };
         let text = String::from_utf8_lossy(&answer.body).into_owned();
         // A new session has no frames yet; the contract says so.
         if path == "/v1/sessions/{id}/rollouts" {
@@ -240,7 +245,7 @@ async fn every_example_of_the_contract_succeeds() {
         }
         bodies += 1;
     }
-    assert_eq!(bodies, 8);
+    assert_eq!(bodies, 9);
 }
 
 #[tokio::test]

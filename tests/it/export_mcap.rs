@@ -8,7 +8,7 @@ use std::sync::atomic::AtomicBool;
 use foreframe_core::frame::warp::CameraModel;
 use foreframe_core::types::{Channel, Seed};
 use foreframe_data::dataset::export::{ACTION_TOPIC, STATE_TOPIC, to_mcap};
-use foreframe_data::dataset::import::{DEFAULT_DISK_MIB, ImportConfig, ImportOptions, import};
+use foreframe_data::dataset::import::{DEFAULT_DISK_MIB, DEFAULT_MAX_FILES, ImportConfig, ImportOptions, import};
 use foreframe_data::dataset::{CollectConfig, Dataset, DatasetInfo, Episode, EpisodeData, collect};
 use foreframe_sim::{RoomSet, Scenario, WorldConfig};
 
@@ -59,6 +59,7 @@ fn imported_from(dataset: &Dataset, episodes: &[Range<usize>], dir: &Path) -> Da
             ..ImportOptions::default()
         },
         disk_mib: DEFAULT_DISK_MIB,
+        max_files: DEFAULT_MAX_FILES,
     };
     let imported = import(&config, &|_| {}, &AtomicBool::new(false)).unwrap();
     assert_eq!(imported.skipped, []);

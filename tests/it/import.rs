@@ -7,7 +7,9 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use foreframe_core::frame::resize::Resize;
 use foreframe_core::frame::{Frame, codec};
 use foreframe_data::dataset::Dataset;
-use foreframe_data::dataset::import::{DEFAULT_DISK_MIB, ImportConfig, ImportError, ImportOptions, Imported, import};
+use foreframe_data::dataset::import::{
+    DEFAULT_DISK_MIB, DEFAULT_MAX_FILES, ImportConfig, ImportError, ImportOptions, Imported, import,
+};
 use serde_json::json;
 
 use crate::recordings::{has_ffmpeg, numpy_array as npy, video};
@@ -18,6 +20,7 @@ pub(crate) fn run(source: &Path, out: &Path, options: ImportOptions) -> Result<I
         out: out.to_owned(),
         options,
         disk_mib: DEFAULT_DISK_MIB,
+        max_files: DEFAULT_MAX_FILES,
     };
     import(&config, &|_| {}, &AtomicBool::new(false))
 }
@@ -257,6 +260,7 @@ fn a_stopped_import_continues_to_the_same_bytes() {
             out: dir.path().join(format!("stopped-{stop_after}")),
             options: options.clone(),
             disk_mib: DEFAULT_DISK_MIB,
+            max_files: DEFAULT_MAX_FILES,
         };
         let (cancelled, most) = (AtomicBool::new(false), AtomicU64::new(0));
         let stopped = import(

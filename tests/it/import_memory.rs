@@ -117,6 +117,7 @@ fn compressed_frames_beyond_the_disk_limit_are_refused() {
                 ..ImportOptions::default()
             },
             disk_mib,
+            max_files: 1,
         };
         import(&config, &|_| {}, &false.into())
     };

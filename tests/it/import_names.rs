@@ -8,7 +8,9 @@ use std::sync::atomic::AtomicBool;
 use std::sync::mpsc;
 use std::time::Duration;
 
-use foreframe_data::dataset::import::{DEFAULT_DISK_MIB, ImportConfig, ImportError, ImportOptions, Imported, import};
+use foreframe_data::dataset::import::{
+    DEFAULT_DISK_MIB, DEFAULT_MAX_FILES, ImportConfig, ImportError, ImportOptions, Imported, import,
+};
 use proptest::prelude::*;
 use proptest::sample::select;
 use serde_json::Value;
@@ -33,6 +35,7 @@ fn run(source: PathBuf, options: ImportOptions) -> Result<Imported, ImportError>
             out: dir.path().join("set"),
             options,
             disk_mib: DEFAULT_DISK_MIB,
+            max_files: DEFAULT_MAX_FILES,
         };
         sender.send(import(&config, &|_| {}, &AtomicBool::new(false)))
     });
@@ -243,6 +246,7 @@ fn a_cancelled_import_of_a_bag_is_stopped_while_it_is_read() {
             out: dir.path().join("set"),
             options: small(),
             disk_mib: DEFAULT_DISK_MIB,
+            max_files: DEFAULT_MAX_FILES,
         };
         let stopped = import(&config, &|_| {}, &AtomicBool::new(true));
         assert!(matches!(stopped, Err(ImportError::Stopped)), "{stopped:?}");

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
 use foreframe_core::types::Seed;
-use foreframe_data::dataset::import::{DEFAULT_DISK_MIB, ImportConfig, ImportOptions, import};
+use foreframe_data::dataset::import::{DEFAULT_DISK_MIB, DEFAULT_MAX_FILES, ImportConfig, ImportOptions, import};
 use foreframe_data::dataset::{CollectConfig, Dataset, DatasetInfo, EpisodeData, collect};
 use foreframe_data::inspection::{FramePlace, FrozenSpan, Inspection, MotionSignal, inspect, page};
 use foreframe_sim::{Scenario, WorldConfig};
@@ -152,6 +152,7 @@ fn steering_of_a_real_car_moves_the_image_later() {
         out: out.clone(),
         options: ImportOptions::default(),
         disk_mib: DEFAULT_DISK_MIB,
+        max_files: DEFAULT_MAX_FILES,
     };
     import(&config, &|_| {}, &AtomicBool::new(false)).unwrap();
     let inspection = inspect(&Dataset::open(&out).unwrap()).unwrap();

@@ -5,6 +5,7 @@ use std::path::Path;
 use axum::body::Body;
 use axum::http::Request;
 use foreframe::server::{App, ServerConfig};
+use foreframe_core::frame::codec;
 use futures_util::FutureExt as _;
 use serde_json::{Value, json};
 
@@ -67,6 +68,14 @@ async fn a_collected_data_set_trains_a_served_model() {
     let exists = post(&app, JOBS, &again).await.detail(409);
     assert_eq!(exists, "name: data set \"seen\" exists; choose another name");
 
+    let estimate = post(&app, "/v1/jobs/estimate", &train("fresh", 3)).await.json();
+    assert_eq!(estimate["steps"], 6);
+    assert!(
+        (1..4096).contains(&estimate["memory_mib"].as_u64().unwrap()),
+        "{estimate}"
+    );
+    post(&app, "/v1/jobs/estimate", &again).await.detail(422);
+
     let first = run_job(&app, &train("fresh", 3)).await;
     assert!(
         first["losses"]["train"].is_number() && first["losses"]["validation"].is_number(),
@@ -96,6 +105,13 @@ async fn a_collected_data_set_trains_a_served_model() {
     );
     let has_validation: Vec<bool> = points.iter().map(|point| point["validation"].is_number()).collect();
     assert_eq!(has_validation, [false, true, true, false, true, true]);
+
+    // Five true frames above five predicted ones.
+    let sample = get(&app, "/v1/jobs/job-2/sample.png").await;
+    assert_eq!(sample.headers["content-type"], "image/png");
+    let sample = codec::decode(&sample.body).unwrap();
+    assert_eq!((sample.width(), sample.height()), (5 * 64 + 4 * 2, 2 * 64 + 2));
+    get(&app, "/v1/jobs/job-1/sample.png").await.detail(404);
 
     let body = json!({"kind": "evaluate", "model": "fresh", "dataset": "seen", "windows": 40, "resamples": 100});
     let measured = run_job(&app, &body).await;

@@ -6,7 +6,9 @@ use std::sync::atomic::AtomicBool;
 
 use foreframe_core::types::Seed;
 use foreframe_data::dataset::export::{to_lerobot_images, to_lerobot_videos, to_mp4};
-use foreframe_data::dataset::import::{DEFAULT_DISK_MIB, ImportConfig, ImportError, ImportOptions, Imported, import};
+use foreframe_data::dataset::import::{
+    DEFAULT_DISK_MIB, DEFAULT_MAX_FILES, ImportConfig, ImportError, ImportOptions, Imported, import,
+};
 use foreframe_data::dataset::{CollectConfig, Dataset, DatasetError, collect};
 use foreframe_sim::{Scenario, WorldConfig};
 use serde_json::{Value, json};
@@ -25,6 +27,7 @@ fn run(source: &Path, out: &Path, options: ImportOptions) -> Result<Imported, Im
             ..options
         },
         disk_mib: DEFAULT_DISK_MIB,
+        max_files: DEFAULT_MAX_FILES,
     };
     import(&config, &|_| {}, &AtomicBool::new(false))
 }

@@ -27,6 +27,7 @@ mod export_mcap;
 mod fixtures;
 mod healthy_robot;
 mod import;
+mod import_archives;
 mod import_hostile;
 mod import_killed;
 mod import_memory;
@@ -99,4 +100,5 @@ mod stream_accuracy;
 #[cfg(feature = "tls")]
 mod tls;
 mod training;
+mod uploads;
 mod warp;

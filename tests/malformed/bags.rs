@@ -6,7 +6,9 @@ use std::sync::mpsc;
 use std::time::Duration;
 
 use foreframe_core::error_text::with_causes;
-use foreframe_data::dataset::import::{DEFAULT_DISK_MIB, ImportConfig, ImportError, ImportOptions, Imported, import};
+use foreframe_data::dataset::import::{
+    DEFAULT_DISK_MIB, DEFAULT_MAX_FILES, ImportConfig, ImportError, ImportOptions, Imported, import,
+};
 use proptest::prelude::*;
 use proptest::sample::Index;
 use tempfile::TempDir;
@@ -47,6 +49,7 @@ fn in_time(name: &str, dir: &Path, skip_bad: bool) -> Result<Imported, ImportErr
             ..ImportOptions::default()
         },
         disk_mib: DEFAULT_DISK_MIB,
+        max_files: DEFAULT_MAX_FILES,
     };
     let (sender, receiver) = mpsc::channel();
     std::thread::spawn(move || sender.send(import(&config, &|_| {}, &AtomicBool::new(false))));

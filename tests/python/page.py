@@ -3,8 +3,11 @@
     page.py PROGRAM MODELS SCRATCH [SCREENSHOTS]
 """
 
+import base64
+import io
 import os
 import pathlib
+import re
 import shutil
 import signal
 import socket
@@ -12,9 +15,11 @@ import subprocess
 import sys
 import time
 import urllib.request
+import zipfile
 import json
 
 from axe_playwright_python.sync_playwright import Axe
+from PIL import Image
 from playwright.sync_api import expect, sync_playwright
 
 VIEWS = ["play", "dream", "what-if", "data", "data?set=room", "train"]
@@ -204,6 +209,46 @@ def an_episode_is_played(browser, server):
     page.context.close()
 
 
+def walk():
+    """An archive of 30 images at 5 frames/s."""
+    archive = io.BytesIO()
+    with zipfile.ZipFile(archive, "w") as file:
+        file.writestr("walk/log.csv", "timestamp,file\n" + "".join(f"{index / 5},{index}.png\n" for index in range(30)))
+        for index in range(30):
+            image = io.BytesIO()
+            Image.effect_noise((64, 48), 20 + index).save(image, "PNG")
+            file.writestr(f"walk/{index}.png", image.getvalue())
+    return archive.getvalue()
+
+
+def a_dropped_file_is_imported(browser, server):
+    page = browser.open("data")
+    drop = page.locator("form.drop")
+    drop.wait_for()
+    transfer = """([name, encoded]) => {
+      const transfer = new DataTransfer();
+      transfer.items.add(new File([Uint8Array.from(atob(encoded), letter => letter.charCodeAt(0))], name));
+      return transfer;
+    }"""
+    dropped = lambda name, content: page.evaluate_handle(transfer, [name, base64.b64encode(content).decode()])
+    drop.dispatch_event("drop", {"dataTransfer": dropped("notes.txt", b"no recording")})
+    expect(drop.locator(".wrong")).to_contain_text("Drop one file: an archive")
+    drop.dispatch_event("drop", {"dataTransfer": dropped("My Walk.zip", walk())})
+    page.get_by_role("link", name="open it").click(timeout=60_000)
+    assert "set=my-walk" in page.evaluate("location.hash")
+    wait_for_pictures(page, 1)
+    # The second import of that name is refused, and its upload can be imported under another name.
+    page.goto(f"{server.address}/#data")
+    page.locator("form.drop input[type=file]").set_input_files({"name": "my walk.zip", "mimeType": "application/zip", "buffer": walk()})
+    expect(page.get_by_text("data set \"my-walk\" exists")).to_be_visible(timeout=20_000)
+    assert page.locator("form.drop input[name=source]").input_value().startswith("upload:")
+    page.locator("form.drop input[name=name]").fill("another-walk")
+    page.get_by_role("button", name="Import", exact=True).click()
+    page.get_by_role("link", name="open it").click(timeout=60_000)
+    assert "set=another-walk" in page.evaluate("location.hash")
+    page.context.close()
+
+
 def a_training_is_watched(browser, server):
     page = browser.open("train")
     page.get_by_label("Preset").locator("option[value=paper]").wait_for(state="attached")
@@ -211,8 +256,11 @@ def a_training_is_watched(browser, server):
     page.get_by_label("Name of the model").fill("tiny")
     page.get_by_label("Steps").fill("40")
     page.get_by_label("Other settings").fill("pretrain.steps=20\nrun.validate_every_steps=10\nmodel.hidden=16\nmodel.features=16")
+    expect(page.locator(".estimate")).to_have_text(re.compile(r"Memory: at least [0-9.]+ [MG]iB of "))
     page.get_by_role("button", name="Train", exact=True).click()
     wait_until(lambda: page.locator(".watched .plot canvas").count() == 1, "losses", 120)
+    width = lambda: page.evaluate("document.querySelector('.sample img')?.naturalWidth")
+    wait_until(lambda: width() == 5 * 64 + 4 * 2, "a sample prediction", 120)
     wait_until(lambda: page.locator("article h3", has_text="tiny").count() == 1, "the new model's card", 240)
     page.context.close()
 
@@ -287,7 +335,7 @@ def main():
     job = server.post("/v1/jobs", collect)["id"]
     wait_until(lambda: (server.get(f"/v1/jobs/{job}") or {}).get("state") == "succeeded", "a data set", 240)
     tests = [opens_on_the_best_drivable_model, keys_and_touch_drive, survives_restarts, a_dream_goes_on_and_is_saved, a_plan_is_chosen_and_taken]
-    tests += [an_episode_is_played, it_is_small, it_rests_when_hidden, a_training_is_watched]
+    tests += [an_episode_is_played, a_dropped_file_is_imported, it_is_small, it_rests_when_hidden, a_training_is_watched]
     only = os.environ.get("PAGE_TEST")
     try:
         with sync_playwright() as playwright:

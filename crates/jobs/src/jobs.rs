@@ -20,6 +20,7 @@ mod runner;
 mod shared;
 pub mod spec;
 pub mod state;
+pub mod uploads;
 
 use crate::store::{JobId, JobIdError, StoreError, unix_s};
 use crate::versions::VersionError;

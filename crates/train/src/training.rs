@@ -7,6 +7,8 @@ mod batches;
 mod checkpoint;
 pub mod config;
 mod error;
+mod event_file;
+mod journal;
 pub mod observer;
 pub mod optimizer;
 mod plan;
@@ -14,6 +16,7 @@ mod preset;
 mod pretrain;
 mod principal_components;
 mod random_codec;
+mod sample;
 mod sequence;
 mod shuffle;
 mod stage;
@@ -28,6 +31,8 @@ use self::checkpoint::{HISTORY_FILE, MODEL_DIR, RunFiles, io_failed};
 use self::config::CodecStart;
 pub use self::config::TrainConfig;
 pub use self::error::TrainError;
+use self::journal::Journal;
+pub use self::journal::SAMPLE_FILE;
 pub use self::observer::{Observer, TrainingEvent, TrainingStage};
 use self::plan::{TrainingPlan, window_frames};
 use self::stage::{StageEnd, StageRunner};
@@ -68,7 +73,8 @@ pub struct Training<'a> {
     pub config: &'a TrainConfig,
     /// The data set.
     pub dataset: &'a Dataset,
-    /// The run's directory. It contains `config.toml`, `checkpoint.safetensors`, and at the end `history.json` and `model/`.
+    /// The run's directory. It contains `config.toml`, `checkpoint.safetensors`, event files for TensorBoard, after the first validation of
+    /// the network `sample.png`, and at the end `history.json` and `model/`.
     pub run_dir: &'a Path,
     /// The command line, for the manifest.
     pub command: &'a str,
@@ -118,6 +124,11 @@ pub fn run(
         step: state.progress.step,
         windows: plan.train.len(),
     });
+    let reached = CheckpointPosition {
+        stage: state.progress.stage,
+        step: state.progress.step,
+    };
+    let mut journal = Journal::open(&files, reached, observer)?;
     let runner = StageRunner {
         files: &files,
         config,
@@ -125,14 +136,14 @@ pub fn run(
     };
     if state.progress.stage == TrainingStage::Pretrain {
         let codec = pretrain::CodecObjective::new(&plan, config)?;
-        if runner.run(&codec, &mut state, observer)? == StageEnd::Interrupted {
+        if runner.run(&codec, &mut state, &mut journal)? == StageEnd::Interrupted {
             return interrupted(TrainingStage::Pretrain, state.progress.step);
         }
         state.start_sequence(&config.run)?;
-        runner.save(&state, observer)?;
+        runner.save(&state, &mut journal)?;
     }
     let objective = sequence::SequenceObjective::new(&plan, config);
-    if runner.run(&objective, &mut state, observer)? == StageEnd::Interrupted {
+    if runner.run(&objective, &mut state, &mut journal)? == StageEnd::Interrupted {
         return interrupted(TrainingStage::Sequence, state.progress.step);
     }
     state.restore_best()?;

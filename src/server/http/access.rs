@@ -22,9 +22,14 @@ pub(in crate::server) fn required_scope(method: &Method, route: &str) -> KeyScop
         "models" if changes_versions => KeyScope::Admin,
         "models" | "sessions" | "environments" | "events" => KeyScope::Predict,
         "datasets" if *method == Method::DELETE => KeyScope::Admin,
-        "datasets" | "jobs" => KeyScope::Jobs,
+        "datasets" | "jobs" | "uploads" => KeyScope::Jobs,
         _ => KeyScope::Admin,
     }
+}
+
+/// Whether the body of a request is written to the disk as it comes: it may be long and take long, and is not held in memory.
+pub(super) fn is_upload(route: &str) -> bool {
+    route == "/v1/uploads"
 }
 
 /// The operations that change state for good: each writes an entry of the audit trail with its change, and is completed also if
@@ -57,6 +62,7 @@ mod tests {
             (Method::GET, "/v1/datasets", KeyScope::Jobs),
             (Method::DELETE, "/v1/datasets/{dataset}", KeyScope::Admin),
             (Method::POST, "/v1/jobs", KeyScope::Jobs),
+            (Method::POST, "/v1/uploads", KeyScope::Jobs),
             (Method::GET, "/v1/audit", KeyScope::Admin),
             (Method::GET, "/v1/new", KeyScope::Admin),
             (

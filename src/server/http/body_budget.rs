@@ -13,6 +13,7 @@ use axum::middleware::Next;
 use axum::response::Response;
 use futures_util::StreamExt as _;
 
+use super::access::{is_upload, route};
 use crate::server::config::ServerConfig;
 
 /// The bytes that are left; clones share them.
@@ -70,9 +71,10 @@ impl Drop for BodyShare {
     }
 }
 
-/// Counts the body of the request, from the arrival of its bytes until the request is answered.
+/// Counts the body of the request, from the arrival of its bytes until the request is answered; not that of an upload, which is not
+/// held.
 pub(in crate::server) async fn count(State(budget): State<BodyBudget>, request: Request, next: Next) -> Response {
-    if request.body().is_end_stream() {
+    if request.body().is_end_stream() || is_upload(route(&request)) {
         return next.run(request).await;
     }
     let share = Arc::new(budget.share());

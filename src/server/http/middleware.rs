@@ -11,7 +11,7 @@ use axum::response::{IntoResponse, Response};
 use metrics::{counter, histogram};
 use tracing::{Instrument, debug, info_span};
 
-use super::access::route;
+use super::access::{is_upload, route};
 use super::problem::{self, ApiError, ErrorForm};
 use crate::server::config::ServerConfig;
 use foreframe_core::metric_names;
@@ -32,14 +32,18 @@ static NEXT_ID: AtomicU64 = AtomicU64::new(1);
 #[derive(Clone)]
 pub(in crate::server) struct RequestTrace {
     limit: Duration,
+    upload_limit: Duration,
     draining: Arc<AtomicBool>,
 }
 
 impl RequestTrace {
     /// `draining` is true while the server stops.
     pub(in crate::server) fn new(config: &ServerConfig, draining: Arc<AtomicBool>) -> Self {
-        let limit = Duration::from_millis(config.request_deadline_ms);
-        Self { limit, draining }
+        Self {
+            limit: Duration::from_millis(config.request_deadline_ms),
+            upload_limit: Duration::from_millis(config.upload_deadline_ms),
+            draining,
+        }
     }
 }
 
@@ -61,7 +65,12 @@ pub(in crate::server) async fn trace(State(trace): State<RequestTrace>, request:
     // Labels with few values, whatever clients send.
     let (method, route) = (method(request.method()), route(&request));
     let route = if route.is_empty() { "none" } else { route }.to_owned();
-    let (limit, form) = (trace.limit, ErrorForm::of(request.uri().path()));
+    let limit = if is_upload(&route) {
+        trace.upload_limit
+    } else {
+        trace.limit
+    };
+    let form = ErrorForm::of(request.uri().path());
     let work = async move {
         let started = Instant::now();
         let answered = async {

@@ -62,6 +62,22 @@ export async function call(method, path, body) {
   return response.status === 204 ? null : response.json();
 }
 
+// Sends a file: `done` is the answer, `stop` breaks it off, `onProgress` gets the share that was sent, which fetch does not tell.
+export function upload(path, file, onProgress) {
+  const used = key, sender = new XMLHttpRequest();
+  const done = new Promise((resolve, reject) => {
+    const headers = { "Content-Type": "application/octet-stream", ...authorization() };
+    sender.open("POST", path);
+    for (const [name, value] of Object.entries(headers)) sender.setRequestHeader(name, value);
+    sender.upload.onprogress = ({ loaded, total }) => onProgress(loaded / total);
+    sender.onload = () => checked(new Response(sender.responseText, { status: sender.status }), used).then(answer => answer.json()).then(resolve, reject);
+    sender.onerror = () => reject(new Error("The connection ended while the file was sent. It may be larger than the server takes (max_upload_mib)."));
+    sender.onabort = () => reject(new Error("The upload was stopped."));
+    sender.send(file);
+  });
+  return { done, stop: () => sender.abort() };
+}
+
 export const get = path => call("GET", path);
 export const text = async path => (await request(path)).text();
 export const blob = async path => (await request(path)).blob();

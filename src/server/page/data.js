@@ -4,6 +4,7 @@ import { html, useState } from "./preact.js";
 import { link, note } from "./address.js";
 import { call } from "./api.js";
 import { Episode, Moving } from "./episode.js";
+import { filled, Import } from "./import_form.js";
 import { Embedded, Progress, Steer, titleOf, useJob } from "./job.js";
 import { Copy, curl, requests } from "./snippets.js";
 
@@ -19,7 +20,7 @@ function Overview({ datasets, missing }) {
   return html`<section>
     <h1>Data sets</h1>
     ${missing && html`<p class="wrong">There is no data set “${missing}”.</p>`}
-    ${!datasets.length && html`<div class="empty"><h2>None yet</h2><p>Collect one from the simulator, or import a recording. It appears here when the job is done.</p></div>`}
+    ${!datasets.length && html`<div class="empty"><h2>None yet</h2><p>Collect one from the simulator, or drop a recording into the form below. It appears here when the job is done.</p></div>`}
     <div class="cards">${datasets.map(dataset => html`<a class="card" key=${dataset.name} href=${link("data", { set: dataset.name })}>
       <${Moving} dataset=${dataset} /><h2>${dataset.name}</h2><${Facts} dataset=${dataset} /></a>`)}</div>
     <${NewData} />
@@ -56,7 +57,7 @@ const SCENARIOS = ["moving-observer", "static-observer", "crowded"];
 function NewData() {
   const [job_id, setJob] = useState(null);
   const [wrong, setWrong] = useState("");
-  const submit = spec => call("POST", "/v1/jobs", spec).then(job => { setJob(job.id); setWrong(""); }, error => setWrong(error.message));
+  const submit = spec => call("POST", "/v1/jobs", spec).then(job => { setJob(job.id); setWrong(""); return true; }, error => { setWrong(error.message); return false; });
   return html`<h2>New data set</h2>
     <div class="forms"><${Collect} submit=${submit} /><${Import} submit=${submit} /></div>
     <p class="wrong" role="alert">${wrong}</p>
@@ -70,34 +71,16 @@ function Follow({ id }) {
     ${job.state === "succeeded" && html`<a href=${link("data", { set: job.spec.name })}>open it</a>`}</div></div>`;
 }
 
-// The fields of a form that are not empty.
-const filled = form => Object.fromEntries([...new FormData(form)].filter(([, value]) => value !== ""));
-const handler = make => event => {
-  event.preventDefault();
-  make(filled(event.target));
-};
-
 function Collect({ submit }) {
-  const onSubmit = handler(({ name, scenario, trials, seed }) => submit({ kind: "collect", name, scenario, trials: +trials, seed: +seed }));
+  const onSubmit = event => {
+    event.preventDefault();
+    const { name, scenario, trials, seed } = filled(event.target);
+    submit({ kind: "collect", name, scenario, trials: +trials, seed: +seed });
+  };
   return html`<form class="card" onSubmit=${onSubmit}><h3>Collect from the simulator</h3><div class="form">
     <label>Name <input name="name" required pattern="[a-z0-9][a-z0-9\\-]*" placeholder="first" /></label>
     <label>Scenario <select name="scenario">${SCENARIOS.map(one => html`<option value=${one}>${one}</option>`)}</select></label>
     <label>Trials <input name="trials" type="number" min="1" max="1000000" value="50" /></label>
     <label>Seed <input name="seed" type="number" min="0" value="1" /></label>
     </div><div class="actions"><button class="main">Collect</button></div></form>`;
-}
-
-function Import({ submit }) {
-  const list = words => words?.split(/[\s,]+/).filter(Boolean);
-  const onSubmit = handler(({ name, source, size, rate, action, state }) => submit({
-    kind: "import", name, source, size, ...(rate && { rate: +rate }), ...(action && { action: list(action) }), ...(state && { state: list(state) }),
-  }));
-  return html`<form class="card" onSubmit=${onSubmit}><h3>Import a recording</h3><div class="form">
-    <label>Name <input name="name" required pattern="[a-z0-9][a-z0-9\\-]*" placeholder="mycar" /></label>
-    <label>Path in the import folder <input name="source" required placeholder="drive-1" /></label>
-    <label>Size <input name="size" value="64x64" pattern="[0-9]{1,4}x[0-9]{1,4}" /></label>
-    <label>Frames per second <input name="rate" type="number" step="any" min="0.01" placeholder="as recorded" /></label>
-    <label>Actions <input name="action" placeholder="found by name" /></label>
-    <label>States <input name="state" placeholder="found by name" /></label>
-    </div><div class="actions"><button class="main">Import</button></div></form>`;
 }

@@ -70,7 +70,7 @@ export function Log({ lines }) {
 }
 
 // A picture of the server, with the key.
-function ServerPicture({ path, alt }) {
+export function ServerPicture({ path, alt }) {
   const [url, setUrl] = useState(null);
   useEffect(() => {
     let made = null, is_gone = false;

@@ -3,7 +3,7 @@
 import { html, useEffect, useMemo, useState } from "./preact.js";
 import { link, note } from "./address.js";
 import { call, get } from "./api.js";
-import { duration, Log, Progress, Report, Steer, titleOf, useJob } from "./job.js";
+import { duration, Log, Progress, Report, ServerPicture, Steer, titleOf, useJob } from "./job.js";
 import { Models } from "./models.js";
 import { COLORS, Plot } from "./plot.js";
 import { Copy, curl, requests } from "./snippets.js";
@@ -62,6 +62,25 @@ function settingsOf(lines, steps) {
   return settings;
 }
 
+// Steps and memory of a training, by the server; null until it is known or if the training is not valid.
+function useEstimate(spec) {
+  const [found, setFound] = useState(null);
+  const asked = JSON.stringify(spec);
+  useEffect(() => {
+    let is_old = false;
+    // Not at every letter that is typed.
+    const timer = setTimeout(() => call("POST", "/v1/jobs/estimate", spec).then(estimate => { if (!is_old) setFound(estimate); }, () => { if (!is_old) setFound(null); }), ESTIMATE_AFTER_MS);
+    return () => {
+      is_old = true;
+      clearTimeout(timer);
+    };
+  }, [asked]);
+  return found;
+}
+
+const memory = mib => (mib < 1024 ? `${mib} MiB` : `${(mib / 1024).toFixed(1)} GiB`);
+const ESTIMATE_AFTER_MS = 300;
+
 // Seconds for each step of finished trainings of a preset here; null if there was none.
 function secondsPerStep(jobs, preset) {
   const done = jobs.find(({ spec, state }) => spec.kind === "train" && spec.preset === preset && state === "succeeded");
@@ -77,16 +96,20 @@ function NewTraining({ datasets, jobs, submit }) {
   const settings = settingsOf(form.settings, form.steps);
   const spec = { kind: "train", name: form.name || dataset.name, preset, dataset: dataset.name, ...(Object.keys(settings).length && { settings }) };
   const pace_s = secondsPerStep(jobs, preset);
-  const estimate = !pace_s ? "No training of this preset has finished here yet, so its time is not known; the job tells it after its first steps."
-    : form.steps ? `About ${duration(pace_s * form.steps)}, from the last training of this preset here.`
-    : `The last training of this preset here took ${(1000 * pace_s).toFixed(0)} ms a step.`;
+  const needs = useEstimate(spec);
+  const time = !pace_s ? "Time: not known, since no training of this preset has finished here yet; the job tells it after its first steps."
+    : needs ? `Time: about ${duration(pace_s * needs.steps)} for ${needs.steps} steps, from the last training of this preset here.`
+    : `Time: ${(1000 * pace_s).toFixed(0)} ms a step in the last training of this preset here.`;
+  const limit = needs?.memory_limit_mib ? ` of ${memory(needs.memory_limit_mib)} that a job may use` : "";
+  const room = needs ? `Memory: at least ${memory(needs.memory_mib)}${limit}.` : "";
+  const is_refused = needs?.memory_limit_mib > 0 && needs.memory_mib > needs.memory_limit_mib;
   return html`<form class="card" onSubmit=${event => { event.preventDefault(); submit(spec); }}><h2>New training</h2><div class="form">
       <label>Data set <select value=${dataset.name} onChange=${set("dataset")}>${datasets.map(({ name }) => html`<option value=${name}>${name}</option>`)}</select></label>
       <label>Preset <select value=${preset} onChange=${set("preset")}>${(presets.length ? presets : [preset]).map(name => html`<option value=${name}>${name}</option>`)}</select></label>
       <label>Name of the model <input value=${form.name} placeholder=${dataset.name} pattern="[a-z0-9][a-z0-9\\-]*" onInput=${set("name")} /></label>
       <label>Steps <input type="number" min="1" value=${form.steps} placeholder="of the preset" onInput=${set("steps")} /></label>
       <label class="wide">Other settings, one a line <textarea rows="2" value=${form.settings} placeholder="sequence.batch_size=16" onInput=${set("settings")} /></label>
-    </div><p class="quiet">${estimate} A training that needs more memory than a job may use is refused.</p>
+    </div><p class="quiet estimate">${time} ${room}</p>${is_refused && html`<p class="wrong">It would be refused: use a smaller model or batch.</p>`}
     <div class="actions"><button class="main">Train</button><${Copy} curl=${() => curl("POST", "/v1/jobs", spec)} python=${() => requests("POST", "/v1/jobs", spec)} /></div></form>`;
 }
 
@@ -121,11 +144,18 @@ function Watched({ id, jobs }) {
     <div class="actions"><${Steer} job=${job} />
       ${job.state === "succeeded" && job.spec.kind === "train" && html`<a href=${link("play", { model: job.spec.name })}>play it</a>`}
       ${job.state === "succeeded" && ["collect", "import"].includes(job.spec.kind) && html`<a href=${link("data", { set: job.spec.name })}>open it</a>`}</div>
-    ${job.spec.kind === "train" && html`<${Curves} id=${id} losses=${losses} jobs=${jobs} />`}
+    ${job.spec.kind === "train" && html`<${Curves} id=${id} losses=${losses} jobs=${jobs} /><${Sample} id=${id} losses=${losses} />`}
     <${Report} job=${job} />
     <details><summary>Log</summary><${Log} lines=${lines} /></details>
     <footer><${Copy} curl=${() => curl("GET", `/v1/jobs/${id}/events`, undefined, " -N")} python=${() => requests("GET", `/v1/jobs/${id}`)} /></footer>
   </div>`;
+}
+
+// What the network predicts at its latest validation.
+function Sample({ id, losses }) {
+  const step = losses.findLast(point => point.stage === "sequence" && point.validation !== null)?.step;
+  return step !== undefined && html`<figure class="sample"><figcaption>A validation window at step ${step}: above the true frames, below the predicted ones</figcaption>
+    <${ServerPicture} path=${`/v1/jobs/${id}/sample.png?step=${step}`} alt="true frames above predicted frames" /></figure>`;
 }
 
 // The losses of a stage as a line: places and values.

@@ -12,14 +12,17 @@ use crate::server::http::extract::{Json, Path, Query};
 use crate::server::http::page;
 use crate::server::http::problem::ApiError;
 use crate::server::state::App;
-use foreframe_jobs::jobs::pipeline::report_key;
+use foreframe_jobs::jobs::memory::TrainingEstimate;
+use foreframe_jobs::jobs::pipeline::{report_key, run_key};
 use foreframe_jobs::jobs::{Job, JobError, JobFilter, JobSpec, JobState};
 use foreframe_jobs::store::{Author, JobId, LogRow, LossRow};
+use foreframe_train::training::SAMPLE_FILE;
 
 /// `max_job_bytes`: the maximum size of the request body of a new job.
 pub(in crate::server) fn routes(max_job_bytes: usize) -> OpenApiRouter<App> {
     OpenApiRouter::new()
         .routes(routes!(create).layer(DefaultBodyLimit::max(max_job_bytes)))
+        .routes(routes!(estimate).layer(DefaultBodyLimit::max(max_job_bytes)))
         .routes(routes!(list))
         .routes(routes!(get))
         .routes(routes!(cancel))
@@ -27,6 +30,7 @@ pub(in crate::server) fn routes(max_job_bytes: usize) -> OpenApiRouter<App> {
         .routes(routes!(logs))
         .routes(routes!(metrics))
         .routes(routes!(file))
+        .routes(routes!(sample))
 }
 
 /// Jobs on a page by default.
@@ -121,6 +125,23 @@ async fn create(
     Ok(accepted(app.jobs().submit_as(author.key_id(), spec, key).await?))
 }
 
+/// Estimates what a training will need, without starting it.
+#[utoipa::path(
+    post, path = "/v1/jobs/estimate",
+    responses(
+        (status = 200, body = TrainingEstimate),
+        (status = 422, description = "Not a valid training; the answer names the field"),
+    )
+)]
+async fn estimate(app: App, Json(spec): Json<JobSpec>) -> Result<axum::Json<TrainingEstimate>, ApiError> {
+    let JobSpec::Train(spec) = spec else {
+        let detail = "kind: only a job of the kind train can be estimated".to_owned();
+        return Err(ApiError::Unprocessable(detail));
+    };
+    let memory = app.config().job_resources().memory;
+    Ok(axum::Json(memory.estimate(&spec, app.store().objects()).await?))
+}
+
 /// Lists jobs, the newest first.
 #[utoipa::path(
     get, path = "/v1/jobs", params(ListQuery),
@@ -202,6 +223,28 @@ async fn file(app: App, Path((id, file)): Path<(String, String)>) -> Result<impl
     }
     let bytes = report_file(&app, id, &file).await?;
     Ok(([(header::CONTENT_TYPE, media_type(&file))], bytes))
+}
+
+/// A sample prediction of a training: the true frames of a validation window above those that were predicted at its latest
+/// validation.
+#[utoipa::path(
+    get, path = "/v1/jobs/{id}/sample.png",
+    responses(
+        (status = 200, description = "The picture", body = Vec<u8>, content_type = "image/png"),
+        (status = 404, description = "No such job, or no prediction yet"),
+    )
+)]
+async fn sample(app: App, Path(id): Path<String>) -> Result<impl IntoResponse, ApiError> {
+    let id = job_id(&id)?;
+    app.jobs().get(id).await?;
+    let picture = app
+        .store()
+        .objects()
+        .read(&format!("{}/{SAMPLE_FILE}", run_key(id)))
+        .await;
+    let picture = picture.map_err(JobError::Store)?;
+    let none = || ApiError::NotFound(format!("job {id} has predicted nothing yet"));
+    Ok(([(header::CONTENT_TYPE, "image/png")], picture.ok_or_else(none)?))
 }
 
 /// The bytes of a file of a report. Copies it to the data directory first if it is only in the object store.

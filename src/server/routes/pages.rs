@@ -28,7 +28,7 @@ macro_rules! page_files {
     };
 }
 
-const PAGE_FILES: [(&str, &str); 28] = page_files![
+const PAGE_FILES: [(&str, &str); 29] = page_files![
     "address.js",
     "api.js",
     "app.js",
@@ -38,6 +38,7 @@ const PAGE_FILES: [(&str, &str); 28] = page_files![
     "episode.js",
     "gif.js",
     "gray.js",
+    "import_form.js",
     "job.js",
     "keys.js",
     "models.js",

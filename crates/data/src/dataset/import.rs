@@ -1,9 +1,10 @@
 //! Turns recordings of real robots into data sets.
 //!
 //! A source (`images`, `donkeycar`, `lerobot`, `numpy`, `npz`, `video` or `bag`) lists its records: time, action, state and where the image
-//! is. `timing` cuts them into episodes at one frame rate. `writer` reads the images, resizes them, and writes shards.
+//! is. `archive` unpacks a source that is one. `timing` cuts them into episodes at one frame rate. `writer` reads the images, resizes them, and writes shards.
 //! Only one shard is in memory at a time.
 
+mod archive;
 mod bag;
 mod camera;
 mod donkeycar;
@@ -23,11 +24,13 @@ mod video;
 mod writer;
 
 use std::collections::BTreeSet;
+use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
+use self::archive::UnpackedSource;
 pub use self::error::ImportError;
 use self::files::{extension, open_file};
-pub use self::options::{DEFAULT_DISK_MIB, ImportConfig, ImportOptions, parse_size};
+pub use self::options::{DEFAULT_DISK_MIB, DEFAULT_MAX_FILES, ImportConfig, ImportOptions, parse_size};
 use self::recording::Recording;
 pub use self::skipped::SkippedItem;
 use self::skipped::listed;
@@ -53,7 +56,9 @@ pub fn import(
     if let Some(finished) = directory.finished()? {
         return Ok(finished);
     }
-    let recording = open(config, cancelled)?;
+    // Its images are read while the data set is written.
+    let source = UnpackedSource::of(config, cancelled)?;
+    let recording = open(&source.path, config, cancelled)?;
     check_channels(&recording)?;
     check_units(options, &recording)?;
     let mut plan = timing::plan(recording, options)?;
@@ -92,8 +97,8 @@ fn check_units(options: &ImportOptions, recording: &Recording) -> Result<(), Imp
 }
 
 /// Reads the records of a source, after finding out of which kind it is.
-fn open(config: &ImportConfig, cancelled: &AtomicBool) -> Result<Recording, ImportError> {
-    let (source, options) = (&config.source, &config.options);
+fn open(source: &Path, config: &ImportConfig, cancelled: &AtomicBool) -> Result<Recording, ImportError> {
+    let options = &config.options;
     if !source.is_dir() {
         open_file(source)?;
     }
@@ -111,8 +116,8 @@ fn open(config: &ImportConfig, cancelled: &AtomicBool) -> Result<Recording, Impo
     }
     match extension(source).as_str() {
         "npy" => numpy::open(source, options),
-        "npz" => npz::open(config, cancelled),
+        "npz" => npz::open(source, config, cancelled),
         "mp4" | "mkv" | "avi" | "mov" | "webm" => video::open(source, options, cancelled),
-        _ => Err(ImportError::UnknownSource(source.clone())),
+        _ => Err(ImportError::UnknownSource(source.to_owned())),
     }
 }

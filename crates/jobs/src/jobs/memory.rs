@@ -2,7 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::JobError;
+use super::{JobError, TrainSpec, datasets};
+use crate::store::Objects;
 use foreframe_core::nn::ArchitectureKind;
 use foreframe_data::dataset::DatasetInfo;
 use foreframe_train::training::TrainConfig;
@@ -45,6 +46,16 @@ impl JobMemory {
         }
     }
 
+    /// What a training will need, without starting it. Errors: `Invalid`, `NotFound`, and those of reading the data set.
+    pub async fn estimate(self, spec: &TrainSpec, objects: &Objects) -> Result<TrainingEstimate, JobError> {
+        let (config, dataset) = (spec.config()?, datasets::describe(objects, &spec.dataset).await?);
+        Ok(TrainingEstimate {
+            steps: config.pretrain.steps + config.sequence.steps,
+            memory_mib: training_mib(&config, &dataset, self.held_mib()),
+            memory_limit_mib: self.limit_mib,
+        })
+    }
+
     /// Errors: `Invalid` if a training certainly needs more memory than a job can use.
     pub(super) fn check(self, config: &TrainConfig, dataset: &DatasetInfo) -> Result<(), JobError> {
         let (allowed, needed) = (self.limit_mib, training_mib(config, dataset, self.held_mib()));
@@ -57,6 +68,17 @@ impl JobMemory {
         );
         Err(JobError::invalid("settings", reason))
     }
+}
+
+/// What a training will need.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, utoipa::ToSchema)]
+pub struct TrainingEstimate {
+    /// Updates of both stages.
+    pub steps: usize,
+    /// The least memory that it needs, in MiB. What is hard to know is left out.
+    pub memory_mib: u64,
+    /// The memory that a job can use, in MiB; 0 for no limit. A training that needs more is refused.
+    pub memory_limit_mib: u64,
 }
 
 impl Default for JobMemory {

@@ -43,8 +43,10 @@ pub struct JobResources {
     pub memory: JobMemory,
     /// The directory that imports may read.
     pub import_dir: Option<PathBuf>,
-    /// Disk space for frames that an import decompresses, in MiB.
+    /// Disk space for what an import decompresses, in MiB.
     pub import_disk_mib: u64,
+    /// Maximum number of files in an archive that is imported.
+    pub max_import_files: u64,
 }
 
 /// Runs jobs in this process.
@@ -90,6 +92,11 @@ impl JobExecutor for Pipeline {
 impl Pipeline {
     async fn check_spec(&self, spec: &JobSpec) -> Result<(), JobError> {
         let objects = self.store.objects();
+        if let JobSpec::Import(spec) = spec
+            && let Some(upload) = spec.upload()?
+        {
+            upload.fetch(objects).await?;
+        }
         let (datasets, models) = (datasets::names(objects).await?, self.versions.all().await?);
         let (data_dir, import_dir) = (objects.data_dir().to_owned(), self.resources.import_dir.clone());
         let checked = spec.clone();
@@ -139,7 +146,7 @@ impl Pipeline {
 
     fn train(&self, spec: &TrainSpec, report: &JobReporter, cancelled: &AtomicBool) -> Result<JobResult, JobFailure> {
         let config = spec.config().map_err(|error| failed(&error))?;
-        let run = format!("runs/{}", report.id());
+        let run = run_key(report.id());
         report.progress(0, 0, "reading the data set");
         let retry = self.retry_policy(report, cancelled);
         retry.run(async || self.prepare_run(&run, report).await)?;
@@ -294,6 +301,12 @@ impl Pipeline {
 #[must_use]
 pub fn report_key(id: JobId) -> String {
     format!("reports/{id}")
+}
+
+/// The key of the directory in which a job trains.
+#[must_use]
+pub fn run_key(id: JobId) -> String {
+    format!("runs/{id}")
 }
 
 /// The request that made the job, as the command of manifests and reports.

@@ -80,6 +80,11 @@ impl<'a> FrameSource<'a> {
         }
     }
 
+    /// The data set.
+    pub(super) fn dataset(&self) -> &'a Dataset {
+        self.dataset
+    }
+
     /// The augmentation of training windows.
     pub(super) fn augmentation(&self) -> &Augmentation {
         &self.augmentation

@@ -108,6 +108,11 @@ impl RunFiles {
         sha256_hex(format!("{}\n{}", self.config_text, self.content_hash).as_bytes())
     }
 
+    /// The directory.
+    pub(super) fn run_dir(&self) -> &Path {
+        &self.run_dir
+    }
+
     /// The path of a file or folder of the run.
     pub(super) fn path(&self, name: &str) -> PathBuf {
         self.run_dir.join(name)

@@ -7,6 +7,7 @@ use super::config::TrainConfig;
 use super::plan::{TrainingPlan, window_frames};
 use super::shuffle::Shuffle;
 use super::stage::{BatchPart, Objective};
+use foreframe_core::frame::Frame;
 use foreframe_core::nn::loss::Loss;
 use foreframe_core::nn::{Network, Parameters};
 use foreframe_data::dataset::Window;
@@ -60,6 +61,10 @@ impl Objective for CodecObjective<'_> {
         let [inputs, targets] = &self.validation;
         let loss = Loss::Mse.between(&self.reconstruct(parameters, inputs)?, targets)?;
         Ok(f64::from(loss.to_scalar::<f32>()?))
+    }
+
+    fn sample(&self, _: &Parameters) -> Result<Option<Frame>, TrainError> {
+        Ok(None)
     }
 }
 

@@ -6,8 +6,10 @@ use super::TrainError;
 use super::batches::{DrawnWindow, WindowBatch};
 use super::config::{CodecTraining, TrainConfig, TrainingFeedback};
 use super::plan::{MixturePart, TrainingPlan};
+use super::sample::{liveliest, side_by_side};
 use super::shuffle::Shuffle;
 use super::stage::{BatchPart, Objective};
+use foreframe_core::frame::Frame;
 use foreframe_core::nn::loss::Loss;
 use foreframe_core::nn::ssim_loss::ssim_loss;
 use foreframe_core::nn::{Feedback, Network, Parameters};
@@ -147,5 +149,35 @@ impl Objective for SequenceObjective<'_> {
         let parts = self.validation_by_part(parameters)?;
         let shares = self.plan.mixture.iter().map(|part| part.part.share);
         Ok(parts.into_iter().zip(shares).map(|(mse, share)| mse * share).sum())
+    }
+
+    fn sample(&self, parameters: &Parameters) -> Result<Option<Frame>, TrainError> {
+        let (dataset, shape, spec) = (self.plan.source.dataset(), self.config.window_shape(), &self.plan.spec);
+        // Of the first data set, where several are joined.
+        let Some(part) = self.plan.mixture.first() else {
+            return Ok(None);
+        };
+        let Some(window) = liveliest(dataset, &part.validation, shape)? else {
+            return Ok(None);
+        };
+        let batch = self
+            .plan
+            .source
+            .windows(&[DrawnWindow::unchanged(window)], shape, false)?;
+        let model = Network::new(spec.clone(), parameters)?;
+        let predicted = model.predict_frames(&batch.inputs, &batch.condition)?;
+        let predicted = predicted.flatten_all()?.to_vec1::<f32>()?;
+        // A training that diverges ends with its next update, which tells what diverged.
+        if predicted.iter().any(|value| !value.is_finite()) {
+            return Ok(None);
+        }
+        let camera = |values| {
+            spec.preprocess
+                .frame_from(values, spec.frame_width_px, spec.frame_height_px)
+        };
+        let predicted: Result<Vec<Frame>, _> = predicted.chunks_exact(spec.pixels()).map(camera).collect();
+        let first = window.first_frame + shape.context;
+        let truth = (first..first + shape.horizon).map(|frame| dataset.frame(frame));
+        side_by_side(&truth.collect::<Result<Vec<_>, _>>()?, &predicted?)
     }
 }

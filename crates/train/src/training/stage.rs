@@ -10,9 +10,11 @@ use rayon::prelude::*;
 use super::TrainError;
 use super::checkpoint::RunFiles;
 use super::config::TrainConfig;
-use super::observer::{Observer, TrainingEvent};
+use super::journal::{CompletedUpdate, CompletedValidation, Journal};
+use super::observer::TrainingEvent;
 use super::optimizer::{Gradients, OptimizerError};
 use super::state::{HistoryPoint, TrainState};
+use foreframe_core::frame::Frame;
 use foreframe_core::nn::Parameters;
 
 /// A larger loss counts as diverged, because pixels are in 0…1.
@@ -24,6 +26,8 @@ pub(super) trait Objective: Sync {
     fn loss(&self, parameters: &Parameters, step: usize, part: BatchPart) -> Result<Tensor, TrainError>;
     /// The mean squared error of the validation split against the target frames.
     fn validation_loss(&self, parameters: &Parameters) -> Result<f64, TrainError>;
+    /// The true frames of a fixed validation window above the predicted ones; `None` if the stage predicts none.
+    fn sample(&self, parameters: &Parameters) -> Result<Option<Frame>, TrainError>;
 }
 
 /// One of the equal parts of a batch, whose gradients are computed in parallel. Their number is a setting and not the number
@@ -63,14 +67,14 @@ impl StageRunner<'_> {
         &self,
         objective: &dyn Objective,
         state: &mut TrainState,
-        observer: &mut dyn Observer,
+        journal: &mut Journal<'_>,
     ) -> Result<StageEnd, TrainError> {
         let (stage, run) = (state.progress.stage, &self.config.run);
         let (steps, learning_rate) = self.config.stage(stage);
         let mut checkpoint_step = state.progress.step;
         while state.progress.step < steps {
             if self.cancelled.load(Ordering::Relaxed) {
-                self.save(state, observer)?;
+                self.save(state, journal)?;
                 return Ok(StageEnd::Interrupted);
             }
             let rate = learning_rate * self.schedule(state.progress.step, steps);
@@ -92,17 +96,20 @@ impl StageRunner<'_> {
                 updated => updated,
             }?;
             state.progress.step = step;
-            observer.on_event(TrainingEvent::Step {
+            let is_validated = step.is_multiple_of(run.validate_every_steps) || step == steps;
+            journal.updated(CompletedUpdate {
                 stage,
                 step,
                 steps,
                 loss,
-            });
-            if step.is_multiple_of(run.validate_every_steps) || step == steps {
-                Self::validate(objective, state, loss, observer)?;
+                learning_rate: rate,
+                is_validated,
+            })?;
+            if is_validated {
+                Self::validate(objective, state, loss, journal)?;
             }
             if step.is_multiple_of(run.checkpoint_every_steps) || step == steps {
-                self.save(state, observer)?;
+                self.save(state, journal)?;
                 checkpoint_step = step;
             }
         }
@@ -138,7 +145,7 @@ impl StageRunner<'_> {
         objective: &dyn Objective,
         state: &mut TrainState,
         train_loss: f64,
-        observer: &mut dyn Observer,
+        journal: &mut Journal<'_>,
     ) -> Result<(), TrainError> {
         let progress = &mut state.progress;
         let (stage, step) = (progress.stage, progress.step);
@@ -154,20 +161,21 @@ impl StageRunner<'_> {
             train_loss,
             validation_loss: loss,
         });
-        observer.on_event(TrainingEvent::Validated {
+        let sample = objective.sample(&state.parameters)?;
+        journal.validated(CompletedValidation {
             stage,
             step,
             loss,
             is_best,
-        });
-        Ok(())
+            sample,
+        })
     }
 
     /// Writes a checkpoint.
-    pub(super) fn save(&self, state: &TrainState, observer: &mut dyn Observer) -> Result<(), TrainError> {
+    pub(super) fn save(&self, state: &TrainState, journal: &mut Journal<'_>) -> Result<(), TrainError> {
         self.files.save(state)?;
         let (stage, step) = (state.progress.stage, state.progress.step);
-        observer.on_event(TrainingEvent::Checkpointed { stage, step });
+        journal.event(TrainingEvent::Checkpointed { stage, step });
         Ok(())
     }
 }

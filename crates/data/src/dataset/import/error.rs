@@ -28,7 +28,7 @@ pub enum ImportError {
     #[error(
         "{} is not a recording that can be imported; give a folder of PNG or JPEG images (with or without a CSV), a \
          Donkeycar tub (manifest.json), a LeRobot data set (meta/info.json), a bag of ROS 2 (.mcap, .db3 or its directory), a .npy \
-         or .npz file, or a video (.mp4, .mkv, .avi, .mov, .webm)",
+         or .npz file, a video (.mp4, .mkv, .avi, .mov, .webm), or an archive of one of these (.zip, .tar, .tar.gz)",
         .0.display()
     )]
     UnknownSource(PathBuf),
@@ -54,6 +54,14 @@ pub enum ImportError {
         path: PathBuf,
         /// The system's reason.
         source: io::Error,
+    },
+    /// An archive cannot or may not be unpacked.
+    #[error("the archive {} {reason}", archive.display())]
+    Archive {
+        /// The archive.
+        archive: PathBuf,
+        /// What is wrong with it or with a file in it.
+        reason: String,
     },
     /// A record is wrong.
     #[error("{place}: {reason}; mend it, or leave out what is damaged with --skip-bad")]

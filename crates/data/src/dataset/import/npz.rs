@@ -42,8 +42,8 @@ const PIECE_BYTES: u64 = 1 << 20;
 
 /// Reads all arrays but the frames. Compressed frames are decompressed beside the data set. Errors: `Option`, `Io`, `Record`,
 /// `Disk`, `Stopped`.
-pub(super) fn open(config: &ImportConfig, cancelled: &AtomicBool) -> Result<Recording, ImportError> {
-    let (path, options) = (config.source.as_path(), &config.options);
+pub(super) fn open(path: &Path, config: &ImportConfig, cancelled: &AtomicBool) -> Result<Recording, ImportError> {
+    let options = &config.options;
     let mut npz = Npz::open(path)?;
     let frames = npz.frames(options)?;
     let place = npz.place(&frames);

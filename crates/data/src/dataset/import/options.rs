@@ -15,18 +15,24 @@ const MAX_EVERY: usize = 1_000_000;
 /// What to import, and how.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ImportConfig {
-    /// The recording: a folder of images, a Donkeycar tub, a `LeRobot` data set, a bag, a `NumPy` file or a video.
+    /// The recording: a folder of images, a Donkeycar tub, a `LeRobot` data set, a bag, a `NumPy` file, a video, or an archive of one
+    /// of these.
     pub source: PathBuf,
     /// The data set's directory.
     pub out: PathBuf,
     /// How its records are read.
     pub options: ImportOptions,
-    /// Disk space for frames that are decompressed before they are imported, in MiB.
+    /// Disk space for what is decompressed before it is imported, an archive or frames, in MiB.
     pub disk_mib: u64,
+    /// Maximum number of files in an archive.
+    pub max_files: u64,
 }
 
 /// The default of [`ImportConfig::disk_mib`].
 pub const DEFAULT_DISK_MIB: u64 = 16 << 10;
+
+/// The default of [`ImportConfig::max_files`].
+pub const DEFAULT_MAX_FILES: u64 = 1_000_000;
 
 /// How a recording is read. All of it has defaults. With the feature `cli`, the fields are options of `foreframe import`, whose
 /// help is what is written above them; the program sets width and height.

@@ -20,11 +20,30 @@ impl Pipeline {
         report: &JobReporter,
         cancelled: &AtomicBool,
     ) -> Result<JobResult, JobFailure> {
+        let objects = self.store.objects();
+        let Some(upload) = spec.upload().map_err(|error| failed(&error))? else {
+            return self.import_here(spec, report, cancelled);
+        };
+        let retry = self.retry_policy(report, cancelled);
+        retry.run(async || upload.fetch(objects).await)?;
+        let result = self.import_here(spec, report, cancelled);
+        upload.forget_copy(objects);
+        result
+    }
+
+    /// Imports what is on this machine.
+    fn import_here(
+        &self,
+        spec: &ImportSpec,
+        report: &JobReporter,
+        cancelled: &AtomicBool,
+    ) -> Result<JobResult, JobFailure> {
         let data_dir = self.store.objects().data_dir();
         let mut config = spec
             .config(data_dir, self.resources.import_dir.as_deref())
             .map_err(|error| failed(&error))?;
         config.disk_mib = self.resources.import_disk_mib;
+        config.max_files = self.resources.max_import_files;
         report.progress(0, 0, "reading the recording");
         let retry = self.retry_policy(report, cancelled);
         let is_stale = |was_deleted| {

@@ -9,15 +9,16 @@ use serde::{Deserialize, Serialize};
 
 use super::{AvailableInputs, name};
 use crate::jobs::JobError;
+use crate::jobs::uploads::UploadedFile;
 use foreframe_core::error_text;
 use foreframe_core::frame::resize::Resize;
 use foreframe_core::types::DatasetName;
 use foreframe_data::dataset::import::{
-    DEFAULT_DISK_MIB, ImportConfig, ImportError, ImportOptions, check_out, parse_size,
+    DEFAULT_DISK_MIB, DEFAULT_MAX_FILES, ImportConfig, ImportError, ImportOptions, check_out, parse_size,
 };
 use foreframe_data::dataset::is_finished;
 
-/// An import: turns a recording in the server's `import_dir` into the data set `name`. The fields are the options of
+/// An import: turns a recording in the server's `import_dir`, or an uploaded file, into the data set `name`. The fields are the options of
 /// `foreframe import`. A cancelled import continues where it stopped when it is resumed, or when the same import is submitted
 /// again.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
@@ -27,7 +28,7 @@ pub struct ImportSpec {
     #[serde(deserialize_with = "name")]
     #[schema(value_type = String, pattern = "^[a-z0-9][a-z0-9-]{0,63}$")]
     pub name: DatasetName,
-    /// The recording: the path of a file or folder below the server's `import_dir`.
+    /// The recording: the path of a file or folder below the server's `import_dir`, or the `source` of an upload.
     #[schema(min_length = 1)]
     pub source: String,
     /// Width and height of the frames in pixels, as in `64x64`.
@@ -122,12 +123,38 @@ impl ImportSpec {
         })
     }
 
-    /// What to import, and where to. Errors: `Invalid` if imports are off, if a path leads out of `import_dir` or to nothing, or
-    /// if an option is out of range.
+    /// The uploaded file that is the source, if it is one. Errors: `Invalid`.
+    pub(in crate::jobs) fn upload(&self) -> Result<Option<UploadedFile>, JobError> {
+        let upload = UploadedFile::of_source(&self.source).transpose();
+        upload.map_err(|error| JobError::invalid("source", error.to_string()))
+    }
+
+    /// What to import, and where to. Errors: `Invalid` if imports are off, if a path leads out of `import_dir` or to nothing, if
+    /// there is no such upload, or if an option is out of range.
     pub(in crate::jobs) fn config(&self, data_dir: &Path, import_dir: Option<&Path>) -> Result<ImportConfig, JobError> {
+        let (source, csv) = match self.upload()? {
+            Some(_) if self.csv.is_some() => {
+                let why = "an uploaded recording brings its own CSV file; leave this out".to_owned();
+                return Err(JobError::invalid("csv", why));
+            }
+            Some(upload) => (upload.existing(data_dir)?, None),
+            None => self.paths(import_dir)?,
+        };
+        Ok(ImportConfig {
+            source,
+            out: data_dir.join("datasets").join(&self.name),
+            options: self.options(csv)?,
+            disk_mib: DEFAULT_DISK_MIB,
+            max_files: DEFAULT_MAX_FILES,
+        })
+    }
+
+    /// The recording and the CSV file. Errors: `Invalid`.
+    fn paths(&self, import_dir: Option<&Path>) -> Result<(PathBuf, Option<PathBuf>), JobError> {
         let Some(import_dir) = import_dir else {
-            let why = "imports are off on this server; set its setting import_dir to the directory with the recordings";
-            return Err(JobError::invalid("source", why.to_owned()));
+            let why = "imports are off on this server; set its setting import_dir to the directory with the recordings, or upload a \
+                       file with POST /v1/uploads";
+            return Err(JobError::invalid("source", why));
         };
         let root = import_dir.canonicalize().map_err(|error| {
             let why = format!("the server's import_dir cannot be read ({error}); create it, or correct the setting");
@@ -136,12 +163,7 @@ impl ImportSpec {
         let source = existing(&root, &self.source, "source")?;
         check_links(&root, &source)?;
         let csv = self.csv.as_deref().map(|csv| existing(&root, csv, "csv")).transpose()?;
-        Ok(ImportConfig {
-            source,
-            out: data_dir.join("datasets").join(&self.name),
-            options: self.options(csv)?,
-            disk_mib: DEFAULT_DISK_MIB,
-        })
+        Ok((source, csv))
     }
 
     /// The options. Errors: `Invalid`, which names the field.

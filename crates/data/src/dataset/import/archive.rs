@@ -1,0 +1,115 @@
+//! Archives of a recording (`.zip`, `.tar`, `.tar.gz`). They are unpacked beside the data set, and imported as the folder would be.
+
+mod tar;
+mod unpacker;
+mod zip_file;
+
+use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicBool;
+
+use flate2::read::MultiGzDecoder;
+
+use self::unpacker::Unpacker;
+use super::files::{entries, open_file};
+use super::{ImportConfig, ImportError};
+use foreframe_core::files::remove_dir;
+
+/// The folder of the data set's directory in which an archive is unpacked. It is hidden, so no object store gets it.
+const UNPACKED: &str = ".unpacked";
+
+/// How an archive is packed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Packing {
+    Zip,
+    Tar,
+    TarGz,
+}
+
+const ENDINGS: [(&str, Packing); 4] = [
+    (".zip", Packing::Zip),
+    (".tar", Packing::Tar),
+    (".tar.gz", Packing::TarGz),
+    (".tgz", Packing::TarGz),
+];
+
+/// The packing and the name without its ending; `None` if the file's name is not that of an archive.
+fn packing(path: &Path) -> Option<(Packing, &str)> {
+    let name = path.file_name()?.to_str()?;
+    ENDINGS.into_iter().find_map(|(ending, packing)| {
+        let (stem, end) = name.split_at_checked(name.len().checked_sub(ending.len())?)?;
+        (!stem.is_empty() && end.eq_ignore_ascii_case(ending)).then_some((packing, stem))
+    })
+}
+
+/// What an import reads: its source or, if that is an archive, what was in it. Dropped, it deletes what was unpacked.
+pub(super) struct UnpackedSource {
+    /// The recording.
+    pub(super) path: PathBuf,
+    folder: PathBuf,
+}
+
+impl UnpackedSource {
+    /// Unpacks the source, if it is an archive. Errors: `Archive`, `Io`, `Stopped`.
+    pub(super) fn of(config: &ImportConfig, cancelled: &AtomicBool) -> Result<Self, ImportError> {
+        let (source, folder) = (&config.source, config.out.join(UNPACKED));
+        // What a killed import left.
+        remove_dir(&folder).map_err(ImportError::io("delete", &folder))?;
+        let Some((packing, stem)) = packing(source).filter(|_| source.is_file()) else {
+            let path = source.clone();
+            return Ok(Self { path, folder });
+        };
+        // The folder has the archive's name, which becomes the recording's.
+        let mut unpacked = Self {
+            path: folder.join(stem),
+            folder,
+        };
+        let mut unpacker = Unpacker::new(config, &unpacked.path, cancelled)?;
+        let file = open_file(source)?;
+        match packing {
+            Packing::Zip => zip_file::unpack(file, &mut unpacker)?,
+            Packing::Tar => tar::unpack(std::io::BufReader::new(file), &mut unpacker)?,
+            Packing::TarGz => tar::unpack(MultiGzDecoder::new(std::io::BufReader::new(file)), &mut unpacker)?,
+        }
+        unpacked.path = recording_in(&unpacked.path)?;
+        Ok(unpacked)
+    }
+}
+
+impl Drop for UnpackedSource {
+    fn drop(&mut self) {
+        // Should it stay, the next run of the same import deletes it, and so does whoever deletes the data set.
+        let _ = remove_dir(&self.folder);
+    }
+}
+
+/// The recording in a folder: what is in it or, as long as that is one folder or file alone, this one. Errors: `Io`.
+fn recording_in(folder: &Path) -> Result<PathBuf, ImportError> {
+    let mut path = folder.to_owned();
+    while path.is_dir() {
+        match entries(&path)?.as_slice() {
+            [only] => path.clone_from(only),
+            _ => break,
+        }
+    }
+    Ok(path)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_ending_of_the_name_tells_an_archive() {
+        for (name, expected) in [
+            ("walk.zip", Some((Packing::Zip, "walk"))),
+            ("a.b.TAR.GZ", Some((Packing::TarGz, "a.b"))),
+            ("walk.tgz", Some((Packing::TarGz, "walk"))),
+            ("walk.tar", Some((Packing::Tar, "walk"))),
+            (".zip", None),
+            ("walk.gz", None),
+            ("ü", None),
+        ] {
+            assert_eq!(packing(Path::new(name)), expected, "{name}");
+        }
+    }
+}

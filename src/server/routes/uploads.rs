@@ -1,0 +1,68 @@
+//! Files for imports.
+
+use axum::body::Body;
+use axum::http::{HeaderMap, StatusCode, header};
+use serde::{Deserialize, Serialize};
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
+
+use crate::server::http::extract::Query;
+use crate::server::http::problem::{ApiError, unfit};
+use crate::server::state::App;
+use crate::server::token::Token;
+use foreframe_jobs::jobs::JobError;
+use foreframe_jobs::jobs::uploads::UploadedFile;
+
+pub(in crate::server) fn routes() -> OpenApiRouter<App> {
+    OpenApiRouter::new().routes(routes!(create))
+}
+
+/// The name of the file.
+#[derive(Debug, Deserialize, utoipa::IntoParams)]
+#[serde(deny_unknown_fields)]
+#[into_params(parameter_in = Query)]
+struct UploadQuery {
+    /// Its name, which tells what it is: an archive, a bag, an array or a video.
+    #[param(
+        pattern = "^[A-Za-z0-9][A-Za-z0-9._ ()+-]{0,110}\\.(zip|tar|tar\\.gz|tgz|mcap|db3|npy|npz|mp4|mkv|avi|mov|webm)$"
+    )]
+    name: String,
+}
+
+/// An uploaded file.
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+struct Upload {
+    /// The `source` of an import job.
+    source: String,
+    /// Its size in bytes.
+    bytes: u64,
+}
+
+/// Uploads a recording for an import job: an archive (.zip, .tar, .tar.gz) of a folder, or a single file. The body is the file. It
+/// is deleted when its import has succeeded or failed, or if none begins within `upload_idle_ms`.
+#[utoipa::path(
+    post, path = "/v1/uploads", params(UploadQuery),
+    request_body(content = Vec<u8>, content_type = "application/octet-stream", description = "The file"),
+    responses(
+        (status = 201, description = "Received", body = Upload),
+        (status = 413, description = "The file exceeds `max_upload_mib`"),
+        (status = 422, description = "A name of no kind that can be imported, or an empty file"),
+        (status = 503, description = "Too many uploads wait for their imports"),
+    )
+)]
+async fn create(
+    app: App,
+    Query(query): Query<UploadQuery>,
+    headers: HeaderMap,
+    body: Body,
+) -> Result<(StatusCode, axum::Json<Upload>), ApiError> {
+    let file = UploadedFile::new(Token::random()?.id(), &query.name).map_err(unfit("name"))?;
+    let stated = headers
+        .get(header::CONTENT_LENGTH)
+        .and_then(|length| length.to_str().ok()?.parse().ok());
+    app.uploads.check_length(stated)?;
+    let bytes = app.uploads.receive(&file, body, &app.blocking).await?;
+    file.push(app.store().objects()).await.map_err(JobError::Store)?;
+    let source = file.to_string();
+    Ok((StatusCode::CREATED, axum::Json(Upload { source, bytes })))
+}

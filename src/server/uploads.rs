@@ -1,0 +1,232 @@
+//! The files that clients upload for their imports: received piece by piece, bounded in size, number and time.
+
+use std::fs::{self, File};
+use std::io::{self, Write as _};
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use axum::body::{Body, Bytes};
+use futures_util::StreamExt as _;
+use tokio::sync::Mutex;
+use tracing::{info, warn};
+
+use super::blocking::BlockingWork;
+use super::config::ServerConfig;
+use super::http::problem::ApiError;
+use foreframe_core::files::{none_if_missing, partial_path, remove_dir};
+use foreframe_jobs::jobs::uploads::{UPLOADS_DIR, UploadedFile};
+use foreframe_jobs::jobs::{Job, JobError, JobFilter, JobSpec, JobState, Jobs};
+use foreframe_jobs::store::{Objects, StoreError};
+
+/// Bytes that are written at once.
+const PIECE_BYTES: usize = 1 << 20;
+/// Import jobs in which an upload is looked for, the newest.
+const MAX_IMPORTS: usize = 1000;
+
+/// The uploads of this server, in its data directory.
+pub(super) struct Uploads {
+    dir: PathBuf,
+    max_bytes: u64,
+    max_count: usize,
+    keep: Duration,
+    /// Held while places are counted and one is taken.
+    turn: Mutex<()>,
+}
+
+impl Uploads {
+    pub(super) fn new(config: &ServerConfig) -> Self {
+        Self {
+            dir: config.data_dir.join(UPLOADS_DIR),
+            max_bytes: config.max_upload_mib << 20,
+            max_count: config.max_uploads,
+            keep: Duration::from_millis(config.upload_idle_ms),
+            turn: Mutex::new(()),
+        }
+    }
+
+    /// Writes a body to a file. What was written is deleted if an error occurs or the client goes away. Returns how many bytes it
+    /// has. Errors: `Unavailable` if there are too many uploads, `TooLarge`, `Unprocessable` if it is empty, `Malformed`.
+    pub(super) async fn receive(
+        &self,
+        file: &UploadedFile,
+        body: Body,
+        threads: &BlockingWork,
+    ) -> Result<u64, ApiError> {
+        let path = file.path(self.dir.parent().unwrap_or(&self.dir));
+        let place = self.place(&path, threads).await?;
+        let opened = threads.run(move || PartialFile::create(path)).await?;
+        let PartialFile {
+            partial,
+            path,
+            file: mut open,
+        } = opened.map_err(|error| away(&self.dir, error))?;
+        let (mut bytes, mut piece) = (0, Vec::new());
+        let mut body = body.into_data_stream();
+        loop {
+            let next = body.next().await.transpose();
+            let next = next.map_err(|error| ApiError::Malformed(format!("the body ended before its end: {error}")))?;
+            let is_last = next.is_none();
+            let next: Bytes = next.unwrap_or_default();
+            bytes += next.len() as u64;
+            if bytes > self.max_bytes {
+                return Err(self.too_large());
+            }
+            piece.extend_from_slice(&next);
+            if is_last || piece.len() >= PIECE_BYTES {
+                let written = std::mem::take(&mut piece);
+                let done = threads.run(move || open.write_all(&written).map(|()| open)).await?;
+                open = done.map_err(|error| away(&self.dir, error))?;
+            }
+            if is_last {
+                break;
+            }
+        }
+        if bytes == 0 {
+            return Err(ApiError::Unprocessable(
+                "the body is empty; send the file in it".to_owned(),
+            ));
+        }
+        let finish = move || open.sync_all().and_then(|()| fs::rename(partial, path));
+        threads.run(finish).await?.map_err(|error| away(&self.dir, error))?;
+        place.keep();
+        Ok(bytes)
+    }
+
+    /// Errors: `TooLarge` if a body that states its length is too long.
+    pub(super) fn check_length(&self, stated: Option<u64>) -> Result<(), ApiError> {
+        match stated {
+            Some(bytes) if bytes > self.max_bytes => Err(self.too_large()),
+            _ => Ok(()),
+        }
+    }
+
+    fn too_large(&self) -> ApiError {
+        let limit_mib = self.max_bytes >> 20;
+        ApiError::TooLarge(match limit_mib {
+            0 => "this server takes no uploads (setting max_upload_mib)".to_owned(),
+            _ => format!("the file has more than {limit_mib} MiB, which this server takes (setting max_upload_mib)"),
+        })
+    }
+
+    /// Makes the directory of an upload. Errors: `Unavailable`.
+    async fn place(&self, path: &Path, threads: &BlockingWork) -> Result<UploadPlace, ApiError> {
+        let _turn = self.turn.lock().await;
+        let (uploads, max_count) = (self.dir.clone(), self.max_count);
+        let place = UploadPlace {
+            dir: path.parent().map(Path::to_owned),
+        };
+        let made = threads.run(move || {
+            if names(&uploads)?.len() >= max_count {
+                return Ok(None);
+            }
+            place.dir.as_deref().map_or(Ok(()), fs::create_dir_all)?;
+            Ok(Some(place))
+        });
+        let made = made.await?.map_err(|error: io::Error| away(&self.dir, error))?;
+        made.ok_or_else(|| {
+            ApiError::unavailable(format!(
+                "{max_count} uploads wait for their imports already (setting max_uploads); import them, or try again later"
+            ))
+        })
+    }
+
+    /// Deletes the uploads whose import has succeeded or failed, and those that no import has used for too long. Errors: those of
+    /// the jobs.
+    pub(super) async fn sweep(&self, jobs: &Jobs, objects: &Objects) -> Result<(), JobError> {
+        let dir = self.dir.clone();
+        let found = tokio::task::spawn_blocking(move || names(&dir)).await;
+        let found = found.unwrap_or_else(|broken| Err(io::Error::other(broken)));
+        let names = found.map_err(|source| StoreError::Io {
+            action: "list",
+            path: self.dir.clone(),
+            source,
+        })?;
+        if names.is_empty() {
+            return Ok(());
+        }
+        let imports = JobFilter {
+            kind: Some("import".to_owned()),
+            limit: MAX_IMPORTS,
+            ..JobFilter::default()
+        };
+        let imports = jobs.list(imports).await?;
+        for name in names {
+            if self.is_over(&name, &imports) {
+                objects.delete(&format!("{UPLOADS_DIR}/{name}")).await?;
+                info!(upload = name, "deleted an upload: its import has ended, or none began");
+            }
+        }
+        Ok(())
+    }
+
+    fn is_over(&self, name: &str, imports: &[Job]) -> bool {
+        let id = format!(":{name}/");
+        let uses = |job: &&Job| matches!(&job.spec, JobSpec::Import(spec) if spec.source.contains(&id));
+        let newest = imports.iter().find(uses).map(|job| job.state);
+        match newest {
+            Some(JobState::Succeeded | JobState::Failed) => true,
+            Some(JobState::Queued | JobState::Running) => false,
+            // It may still be imported, or resumed.
+            Some(JobState::Cancelled) | None => age(&self.dir.join(name)).is_some_and(|age| age > self.keep),
+        }
+    }
+}
+
+/// A file that is being written, and its name when it is whole.
+struct PartialFile {
+    partial: PathBuf,
+    path: PathBuf,
+    file: File,
+}
+
+impl PartialFile {
+    fn create(path: PathBuf) -> io::Result<Self> {
+        let partial = partial_path(&path)?;
+        let file = File::create_new(&partial)?;
+        Ok(Self { partial, path, file })
+    }
+}
+
+/// The directory of an upload, deleted with this unless it is kept.
+struct UploadPlace {
+    dir: Option<PathBuf>,
+}
+
+impl UploadPlace {
+    fn keep(mut self) {
+        self.dir = None;
+    }
+}
+
+impl Drop for UploadPlace {
+    fn drop(&mut self) {
+        if let Some(dir) = &self.dir
+            && let Err(error) = remove_dir(dir)
+        {
+            warn!(%error, dir = %dir.display(), "could not delete an upload that was broken off; it is tried again later");
+        }
+    }
+}
+
+/// The names in the directory of the uploads.
+fn names(dir: &Path) -> io::Result<Vec<String>> {
+    let entries = none_if_missing(fs::read_dir(dir))?.into_iter().flatten();
+    let names = entries.map(|entry| Ok(entry?.file_name().to_string_lossy().into_owned()));
+    names.collect()
+}
+
+/// How long ago anything in a directory was written.
+fn age(dir: &Path) -> Option<Duration> {
+    let inner = fs::read_dir(dir).ok()?.flatten().map(|entry| entry.path());
+    let ages = inner.chain([dir.to_owned()]).filter_map(|path| {
+        let modified = fs::metadata(path).and_then(|found| found.modified()).ok()?;
+        modified.elapsed().ok()
+    });
+    ages.min()
+}
+
+/// The answer when the data directory cannot be written.
+fn away(path: &Path, source: io::Error) -> ApiError {
+    let (action, path) = ("write", path.to_owned());
+    ApiError::of_own_data(&StoreError::Io { action, path, source })
+}
