@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use super::error::CliError;
 use super::interrupt;
+use super::next_step::shell_path;
 use super::process::{command_line, print_line};
 use super::progress::ProgressLine;
 use super::settings::DirectoryArgs;
@@ -75,7 +76,7 @@ pub(super) fn run(args: &TrainArgs) -> Result<(), CliError> {
         .out
         .clone()
         .unwrap_or_else(|| PathBuf::from("runs").join(&config.name));
-    let command = command_line();
+    let (command, flags) = (command_line(), args.directories.repeated());
     let training = Training {
         config: &config,
         dataset: &dataset,
@@ -96,13 +97,15 @@ pub(super) fn run(args: &TrainArgs) -> Result<(), CliError> {
         TrainingOutcome::Finished { model_dir, manifest } => {
             evaluation::calibrate_trained(&model_dir, &dataset, &cancelled).map_err(CliError::not_calibrated)?;
             print_line(format!(
-                "{}: {} parameters, validation {}\nnext: foreframe evaluate --model {} --dataset {}\n      foreframe publish {}",
+                "{}: {} parameters, validation MSE {:.6} at step {}\nnext: foreframe evaluate --model {} --dataset {}{flags}\n      \
+                 foreframe publish {}{flags}",
                 model_dir.display(),
                 manifest.parameters,
-                manifest.metrics["validation"],
-                model_dir.display(),
-                dataset_dir.display(),
-                run_dir.display(),
+                manifest.metrics["validation"]["mse"].as_f64().unwrap_or(f64::NAN),
+                manifest.metrics["validation"]["step"],
+                shell_path(&model_dir),
+                shell_path(&dataset_dir),
+                shell_path(&run_dir),
             ))
         }
         TrainingOutcome::Interrupted { stage, step } => Err(CliError::Interrupted(format!(

@@ -51,6 +51,7 @@ mod metrics;
 mod model_cards;
 mod moving_mnist;
 mod msgpack;
+mod next_commands;
 mod nn_cell;
 mod nn_fixtures;
 mod nn_flow;

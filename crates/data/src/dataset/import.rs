@@ -31,6 +31,7 @@ pub use self::options::{DEFAULT_DISK_MIB, ImportConfig, ImportOptions, parse_siz
 use self::recording::Recording;
 pub use self::skipped::SkippedItem;
 use self::skipped::listed;
+use self::timing::ImportPlan;
 pub use self::writer::{ImportProgress, Imported, saved_shards};
 use foreframe_core::types::Channel;
 
@@ -41,7 +42,7 @@ pub fn check_out(config: &ImportConfig) -> Result<(), ImportError> {
 }
 
 /// Imports a recording, or continues an import that was stopped; the result has the same bytes either way. Returns at once
-/// if the data set is complete. Errors: every [`ImportError`].
+/// if the data set is complete. An import that fails before its first shard leaves nothing. Errors: every [`ImportError`].
 pub fn import(
     config: &ImportConfig,
     on_progress: &(dyn Fn(ImportProgress) + Sync),
@@ -53,12 +54,22 @@ pub fn import(
     if let Some(finished) = directory.finished()? {
         return Ok(finished);
     }
+    let imported = plan(config, cancelled).and_then(|plan| directory.write(&plan, on_progress, cancelled));
+    if imported.is_err() {
+        directory.discard();
+    }
+    imported
+}
+
+/// Reads what is to be written. Errors: those of the source, `Option`, `Record`, `Empty`, `Stopped`.
+fn plan(config: &ImportConfig, cancelled: &AtomicBool) -> Result<ImportPlan, ImportError> {
+    let options = &config.options;
     let recording = open(config, cancelled)?;
     check_channels(&recording)?;
     check_units(options, &recording)?;
     let mut plan = timing::plan(recording, options)?;
     camera::describe(&mut plan, options, cancelled)?;
-    directory.write(&plan, on_progress, cancelled)
+    Ok(plan)
 }
 
 /// Errors: `Option` if two components of the action or of the state have the same name.
