@@ -1,8 +1,8 @@
 //! The command line, one file for each subcommand, or for two that belong together. Exit code 2: the command cannot be
 //! carried out as it was given. Exit code 1: it failed. Exit code 130: it was interrupted.
 //!
-//! Subcommands do not use each other. What they share is, in the order in which it may use each other: `error`, `process` and
-//! `progress`, `interrupt`, `table`, `scores`, `settings`, `output`, `admin_address`, `workspace`.
+//! Subcommands do not use each other. What they share is, in the order in which it may use each other: `error`, `next_step`,
+//! `process` and `progress`, `interrupt`, `table`, `scores`, `settings`, `output`, `admin_address`, `workspace`.
 
 mod admin_address;
 mod backup;
@@ -18,6 +18,7 @@ mod inspect;
 mod interrupt;
 mod keys;
 mod models;
+mod next_step;
 mod output;
 mod predict;
 mod process;

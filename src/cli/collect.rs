@@ -8,25 +8,23 @@ use clap::value_parser;
 
 use super::error::CliError;
 use super::interrupt;
+use super::next_step::{first_trainable, shell_path};
 use super::process::print_line;
 use super::progress::ProgressLine;
 use super::settings::CommonArgs;
-use super::workspace::Workspace;
-use foreframe_core::types::Seed;
+use super::workspace::{Workspace, dataset_name};
+use foreframe_core::types::{DatasetName, Seed};
+use foreframe_data::dataset::DatasetInfo;
 use foreframe_data::dataset::collect::{CollectConfig, CollectProgress, collect};
 use foreframe_data::dataset::moving_mnist::{
     DEFAULT_FRAMES, MAX_FRAMES, MOVING_MNIST, MovingMnistConfig, collect_digits,
 };
-use foreframe_data::dataset::{Dataset, DatasetInfo, Split, Splits};
 use foreframe_jobs::jobs::spec::MAX_TRIALS;
 use foreframe_sim::{Look, RoomSet, Scenario, SimError, WorldConfig};
 use foreframe_train::training::TrainConfig;
-use foreframe_train::training::config::WindowBudget;
 
 /// More threads would only wait for each other.
 const MAX_THREADS: i64 = 256;
-/// Larger data sets have windows enough for every preset, and take long to read.
-const MAX_COUNTED_BYTES: u64 = 400 << 20;
 /// Trials that are enough for a training.
 const ENOUGH_TRIALS: u64 = 40;
 
@@ -63,14 +61,15 @@ impl fmt::Display for CollectSubject {
 /// Simulate trials and store their frames, actions and states as a data set.
 ///
 /// The data set is stored as Parquet files in the LeRobot v3 layout. Ctrl-C keeps the trials that are finished; the same
-/// command continues, and the result is the same as without the interruption. Of moving-mnist, the last tenth of the trials is
+/// command continues, and the result is the same as without the interruption. With more `--trials`, it adds those to the data
+/// set that is there. Of moving-mnist, the last tenth of the trials is
 /// the test split, with digits of their own, and the tenth before it the validation split.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   foreframe collect --trials 200
   foreframe collect --scenario moving-observer --trials 500
   foreframe collect --scenario moving-observer --rooms varied --trials 500
-  foreframe collect --trials 60 --seed 2 --out data/datasets/small
+  foreframe collect --trials 60 --seed 2 --name small
   foreframe collect --scenario moving-mnist --digits mnist/ --trials 10000")]
 pub(super) struct CollectArgs {
     /// static-observer (the camera stands, one robot drives), moving-observer (the camera robot drives too), crowded
@@ -90,8 +89,11 @@ pub(super) struct CollectArgs {
     /// The seed of all random numbers: the same seed gives the same bytes
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    /// The directory of the data set [default: `DATA_DIR/datasets/SCENARIO`, with `--rooms` `SCENARIO-SET`]
-    #[arg(long, value_name = "DIR")]
+    /// The data set's name [default: SCENARIO, with `--rooms` SCENARIO-SET]
+    #[arg(long)]
+    name: Option<String>,
+    /// The data set's directory [default: `DATA_DIR/datasets/NAME`]
+    #[arg(long, value_name = "DIR", conflicts_with = "name")]
     out: Option<PathBuf>,
     /// Threads that simulate [default: one for each core]
     #[arg(long, value_parser = value_parser!(u16).range(1..=MAX_THREADS))]
@@ -122,7 +124,7 @@ pub(super) fn run(args: &CollectArgs) -> Result<(), CliError> {
     let workspace = Workspace::new(args.settings.start()?);
     let out = match &args.out {
         Some(out) => out.clone(),
-        None => workspace.datasets_dir().join(default_name(args)),
+        None => workspace.datasets_dir().join(name(args)?),
     };
     let (cancelled, progress) = (interrupt::flag()?, ProgressLine::new("trials"));
     progress.label(&format!("collecting {}", args.scenario));
@@ -169,12 +171,18 @@ pub(super) fn run(args: &CollectArgs) -> Result<(), CliError> {
     print_line(format!("next: {}", next_step(args, &out, &info)?))
 }
 
-/// The name of the data set's directory, unless it is given.
-fn default_name(args: &CollectArgs) -> String {
-    match args.rooms {
+/// The data set's name. Errors: `Usage` if the given one is not valid.
+fn name(args: &CollectArgs) -> Result<DatasetName, CliError> {
+    if let Some(name) = &args.name {
+        return dataset_name(name);
+    }
+    let name = match args.rooms {
         Some(rooms) => format!("{}-{rooms}", args.scenario),
         None => args.scenario.to_string(),
-    }
+    };
+    Ok(name
+        .parse()
+        .expect("a scenario whose name is not one of a data set is a bug"))
 }
 
 /// The collection of a simulated scenario.
@@ -190,30 +198,28 @@ fn simulation(args: &CollectArgs, scenario: Scenario, out: &Path) -> CollectConf
     config
 }
 
-/// A training command that works on the data set, or what to do if it is too small to train on.
+/// A command that works on the data set, or what to do if it is too small to train on.
 fn next_step(args: &CollectArgs, out: &Path, info: &DatasetInfo) -> Result<String, CliError> {
+    let (dataset, flags) = (shell_path(out), args.settings.repeated());
     if args.rooms.is_some_and(RoomSet::is_only_for_tests) {
-        let out = out.display();
         return Ok(format!(
-            "foreframe evaluate --model MODEL --dataset {out} (these rooms are only for tests)"
+            "foreframe evaluate --model rooms --dataset {dataset}{flags}   # or another model; these rooms are only for tests"
         ));
     }
     let presets: &[&str] = match args.scenario {
         CollectSubject::Simulated(Scenario::StaticObserver) => &["paper", "static"],
+        CollectSubject::Simulated(Scenario::MovingObserver) if args.rooms.is_some() => &["rooms"],
         CollectSubject::Simulated(Scenario::MovingObserver) => &["moving"],
         CollectSubject::Simulated(Scenario::Crowded) => &["static"],
         CollectSubject::MovingMnist => &[MOVING_MNIST],
     };
-    let is_large = info.decoded_bytes() > MAX_COUNTED_BYTES;
-    let dataset = (!is_large).then(|| Dataset::open(out)).transpose()?;
-    for preset in presets {
-        let config = TrainConfig::preset(preset)?;
-        if dataset
-            .as_ref()
-            .is_none_or(|dataset| has_enough_windows(&config, dataset))
-        {
-            return Ok(format!("foreframe train --preset {preset} --dataset {}", out.display()));
-        }
+    let configs: Vec<TrainConfig> = presets
+        .iter()
+        .map(|preset| TrainConfig::preset(preset))
+        .collect::<Result<_, _>>()?;
+    // A preset's name is that of its configuration.
+    if let Some(TrainConfig { name: preset, .. }) = first_trainable(out, info, configs)? {
+        return Ok(format!("foreframe train --preset {preset} --dataset {dataset}{flags}"));
     }
     if args.scenario == CollectSubject::MovingMnist && usize::from(args.frames) < DEFAULT_FRAMES {
         return Ok(format!(
@@ -222,23 +228,12 @@ fn next_step(args: &CollectArgs, out: &Path, info: &DatasetInfo) -> Result<Strin
             args.frames
         ));
     }
+    if args.scenario == CollectSubject::MovingMnist {
+        return Ok("collect more trials into another directory; these are too few to train on".to_owned());
+    }
     let trials = ENOUGH_TRIALS.max(args.trials + 1);
     Ok(format!(
-        "collect more trials into another directory, as with --trials {trials}; {} are too few to train on",
+        "the same command with --trials {trials}, which adds trials; {} are too few to train on",
         args.trials
     ))
-}
-
-/// Whether a training with this configuration finds windows enough in the data set.
-fn has_enough_windows(config: &TrainConfig, dataset: &Dataset) -> bool {
-    let splits = Splits::new(dataset, config.data.split_seed);
-    let count = |split| {
-        let windows = splits.windows(dataset, split, config.window_shape(), 1);
-        windows.map_or(0, |windows| windows.len())
-    };
-    let needed = match config.data.windows {
-        WindowBudget::Count(count) => count,
-        WindowBudget::All => 1,
-    };
-    count(Split::Train) >= needed && count(Split::Validation) > 0
 }

@@ -7,6 +7,7 @@ use clap::value_parser;
 use serde_json::json;
 
 use super::error::CliError;
+use super::next_step::{name_from, shell_path};
 use super::output::OutputDirectory;
 use super::process::print_line;
 use super::settings::CommonArgs;
@@ -82,9 +83,14 @@ pub(super) fn run(args: &ExportArgs) -> Result<(), CliError> {
         ExportFormat::Lerobot => write_lerobot(args, &dataset),
         ExportFormat::Mcap if !is_part => {
             let episodes: Vec<_> = dataset.episodes().iter().map(Episode::frames).collect();
-            write_mcap(args, &dataset, &episodes)
+            write_mcap(args, &dataset, &episodes, &workspace.datasets_dir())
         }
-        ExportFormat::Mcap => write_mcap(args, &dataset, &[selected(args, &dir, &dataset)?]),
+        ExportFormat::Mcap => write_mcap(
+            args,
+            &dataset,
+            &[selected(args, &dir, &dataset)?],
+            &workspace.datasets_dir(),
+        ),
         ExportFormat::Mp4 => write_mp4(args, &dataset, selected(args, &dir, &dataset)?),
         ExportFormat::Png => write_png(args, &dataset, selected(args, &dir, &dataset)?),
     }
@@ -140,7 +146,12 @@ fn refuse_existing(args: &ExportArgs) -> Result<(), CliError> {
     Ok(())
 }
 
-fn write_mcap(args: &ExportArgs, dataset: &Dataset, episodes: &[Range<usize>]) -> Result<(), CliError> {
+fn write_mcap(
+    args: &ExportArgs,
+    dataset: &Dataset,
+    episodes: &[Range<usize>],
+    datasets_dir: &Path,
+) -> Result<(), CliError> {
     refuse_existing(args)?;
     if args.out.extension().is_none_or(|extension| extension != "mcap") {
         return Err(CliError::Usage(format!(
@@ -157,9 +168,19 @@ fn write_mcap(args: &ExportArgs, dataset: &Dataset, episodes: &[Range<usize>]) -
     let state = topic(STATE_TOPIC, &info.state_channels);
     let (width, height) = (info.frame_width_px, info.frame_height_px);
     let command = format!(
-        "foreframe import {out} --image {IMAGE_TOPIC} --size {width}x{height} --action {action} --state {state}"
+        "foreframe import {} --name {} --image {IMAGE_TOPIC} --size {width}x{height} --action {action} --state {state}{}",
+        shell_path(&args.out),
+        unused_name(&args.out, datasets_dir),
+        args.settings.repeated()
     );
     print_line(format!("to import it again: {command}"))
+}
+
+/// A name for the data set that an import of the file makes: that of the file, with a number if there is one.
+fn unused_name(file: &Path, datasets_dir: &Path) -> String {
+    let stem = name_from(&file.file_stem().unwrap_or_default().to_string_lossy(), "recording");
+    let mut names = std::iter::once(stem.clone()).chain((2..).map(|number| format!("{stem}-{number}")));
+    names.find(|name| !datasets_dir.join(name).exists()).unwrap_or(stem)
 }
 
 fn write_mp4(args: &ExportArgs, dataset: &Dataset, range: Range<usize>) -> Result<(), CliError> {

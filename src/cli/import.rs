@@ -1,19 +1,23 @@
 //! `foreframe import`
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use super::error::CliError;
 use super::interrupt;
+use super::next_step::{first_trainable, name_from, shell_path};
 use super::process::print_line;
 use super::progress::ProgressLine;
 use super::settings::CommonArgs;
-use super::workspace::Workspace;
+use super::workspace::{Workspace, dataset_name};
 use foreframe_core::types::DatasetName;
 use foreframe_data::dataset::import::{ImportConfig, ImportOptions, import, parse_size};
 use foreframe_data::dataset::{DatasetInfo, is_finished};
+use foreframe_train::training::TrainConfig;
 
 /// How many left-out items are printed.
 const LISTED_ITEMS: usize = 10;
+/// The preset for recordings.
+const PRESET: &str = "recording";
 
 /// Turn a recording into a data set.
 ///
@@ -57,6 +61,7 @@ pub(super) fn run(args: ImportArgs) -> Result<(), CliError> {
         Some(out) => out.clone(),
         None => workspace.datasets_dir().join(name(&args)?),
     };
+    let flags = args.settings.repeated();
     let config = ImportConfig {
         source: args.source,
         out: out.clone(),
@@ -101,38 +106,49 @@ pub(super) fn run(args: ImportArgs) -> Result<(), CliError> {
             print_line(format!("  … more of them are in {}", list.display()))?;
         }
     }
-    let (name, conditioning) = (&info.name, conditioning(info));
-    print_line(format!("next: foreframe inspect {shown}"))?;
+    for note in &imported.notes {
+        print_line(format!("note: {note}"))?;
+    }
+    next_steps(&out, info, &flags)
+}
+
+/// Prints the commands that work on the data set.
+fn next_steps(out: &Path, info: &DatasetInfo, flags: &str) -> Result<(), CliError> {
+    let dataset = shell_path(out);
+    print_line(format!("next: foreframe inspect {dataset}{flags}"))?;
+    let config = TrainConfig::layered(PRESET, None, &conditioning(info))?;
+    if first_trainable(out, info, [config])?.is_none() {
+        return print_line(format!(
+            "      record more before you train: {} frames in {} episodes are too few for training and validation",
+            info.frame_count, info.episode_count
+        ));
+    }
+    let settings = [format!("name={}", name_from(&info.name, "recording"))];
+    let settings = settings.into_iter().chain(conditioning(info));
+    let settings: String = settings.map(|setting| format!(" --set {setting}")).collect();
     print_line(format!(
-        "      foreframe train --preset recording --dataset {shown} --set name={name}{conditioning}"
+        "      foreframe train --preset {PRESET} --dataset {dataset}{settings}{flags}"
     ))
 }
 
-/// The setting that makes the preset for recordings fit the data set's channels.
-fn conditioning(info: &DatasetInfo) -> &'static str {
-    match (info.action_channels.is_empty(), info.state_channels.is_empty()) {
-        (false, false) => " --set model.conditioning=state-action",
-        (false, true) => "",
-        (true, false) => " --set model.conditioning=state",
-        (true, true) => " --set model.conditioning=none",
-    }
+/// The setting that makes the preset for recordings fit the data set's channels, if it needs one.
+fn conditioning(info: &DatasetInfo) -> Vec<String> {
+    let conditioning = match (info.action_channels.is_empty(), info.state_channels.is_empty()) {
+        (false, false) => "state-action",
+        (false, true) => return Vec::new(),
+        (true, false) => "state",
+        (true, true) => "none",
+    };
+    vec![format!("model.conditioning={conditioning}")]
 }
 
 /// The data set's name: the one given, or one made of the source's. Errors: `Usage` if the given name is not valid.
 fn name(args: &ImportArgs) -> Result<DatasetName, CliError> {
     if let Some(name) = &args.name {
-        return name.parse().map_err(|_| {
-            CliError::Usage(format!(
-                "--name is {name:?}; a name has 1 to 64 characters of a to z, 0 to 9 and -, and does not start with -"
-            ))
-        });
+        return dataset_name(name);
     }
     let source = args.source.canonicalize().unwrap_or_else(|_| args.source.clone());
     let stem = source.file_stem().unwrap_or_default().to_string_lossy().to_lowercase();
-    let stem = stem.strip_suffix(".tar").unwrap_or(&stem);
-    let allowed = |c: char| if c.is_ascii_alphanumeric() { c } else { '-' };
-    let name: String = stem.chars().map(allowed).take(64).collect();
-    let name = name.trim_matches('-');
-    let name = if name.is_empty() { "recording" } else { name };
+    let name = name_from(stem.strip_suffix(".tar").unwrap_or(&stem), "recording");
     Ok(name.parse().expect("a data set's name with other characters is a bug"))
 }

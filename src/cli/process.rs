@@ -4,6 +4,7 @@ use std::fmt::Display;
 use std::io::Write as _;
 
 use super::error::CliError;
+use super::next_step::shell_word;
 use foreframe_core::error_text::printable;
 
 /// Writes a line to standard output.
@@ -18,8 +19,7 @@ pub(super) fn command_line() -> String {
         .enumerate()
         .map(|(index, argument)| match index {
             0 => "foreframe".to_owned(),
-            _ if argument.contains([' ', '"', '\'']) => format!("'{}'", argument.replace('\'', r"'\''")),
-            _ => argument,
+            _ => shell_word(&argument),
         })
         .collect::<Vec<_>>()
         .join(" ")

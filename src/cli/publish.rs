@@ -49,7 +49,8 @@ pub(super) fn run(args: &PublishArgs) -> Result<(), CliError> {
     })?;
     if args.no_activate {
         print_line(format!(
-            "published {name}@{version}; `foreframe models activate {name}@{version}` makes it the active version"
+            "published {name}@{version}; `foreframe models activate {name}@{version}{}` makes it the active version",
+            args.settings.repeated()
         ))
     } else {
         print_line(format!("published {name}@{version}; it is the active version"))

@@ -8,6 +8,7 @@ use clap::builder::NonEmptyStringValueParser;
 use serde::Serialize;
 
 use super::error::CliError;
+use super::next_step::shell_word;
 use crate::config::{Config, LoadedConfig};
 use crate::telemetry;
 use foreframe_jobs::store::Store;
@@ -37,6 +38,20 @@ pub(super) struct DirectoryArgs {
 }
 
 impl DirectoryArgs {
+    /// The directories and URLs that were given as flags, each with a space before it, for a command to be run next.
+    pub(super) fn repeated(&self) -> String {
+        let flags = [
+            ("--data-dir", &self.data_dir),
+            ("--models-dir", &self.models_dir),
+            ("--database-url", &self.database_url),
+            ("--objects-url", &self.objects_url),
+        ];
+        let given = flags
+            .iter()
+            .filter_map(|(flag, value)| Some(format!(" {flag} {}", shell_word(value.as_deref()?))));
+        given.collect()
+    }
+
     /// The configuration with these flags over everything else; starts the log.
     pub(super) fn start(&self) -> Result<Config, CliError> {
         start(LoadedConfig::read(None, flag_layers(self))?)
@@ -60,6 +75,11 @@ impl CommonArgs {
     /// The configuration with these flags over everything else; starts the log.
     pub(super) fn start(&self) -> Result<Config, CliError> {
         start(self.load()?)
+    }
+
+    /// See [`DirectoryArgs::repeated`].
+    pub(super) fn repeated(&self) -> String {
+        self.directories.repeated()
     }
 
     /// The configuration with these flags over everything else.

@@ -5,6 +5,7 @@ use std::str::FromStr;
 
 use super::error::CliError;
 use super::interrupt;
+use super::next_step::shell_path;
 use super::process::{command_line, print_line};
 use super::progress::ProgressLine;
 use super::settings::DirectoryArgs;
@@ -86,7 +87,7 @@ pub(super) fn run(args: &TrainArgs) -> Result<(), CliError> {
         .out
         .clone()
         .unwrap_or_else(|| PathBuf::from("runs").join(&config.name));
-    let command = command_line();
+    let (command, flags) = (command_line(), args.directories.repeated());
     let training = Training {
         config: &config,
         dataset: &dataset,
@@ -107,16 +108,17 @@ pub(super) fn run(args: &TrainArgs) -> Result<(), CliError> {
         TrainingOutcome::Finished { model_dir, manifest } => {
             evaluation::calibrate_trained(&model_dir, &dataset, &cancelled).map_err(CliError::not_calibrated)?;
             let evaluations = directories.iter().map(|directory| {
-                let (model, dataset) = (model_dir.display(), directory.display());
-                format!("foreframe evaluate --model {model} --dataset {dataset}\n      ")
+                let (model, dataset) = (shell_path(&model_dir), shell_path(directory));
+                format!("foreframe evaluate --model {model} --dataset {dataset}{flags}\n      ")
             });
             print_line(format!(
-                "{}: {} parameters, validation {}\nnext: {}foreframe publish {}",
+                "{}: {} parameters, validation MSE {:.6} at step {}\nnext: {}foreframe publish {}{flags}",
                 model_dir.display(),
                 manifest.parameters,
-                manifest.metrics["validation"],
+                manifest.metrics["validation"]["mse"].as_f64().unwrap_or(f64::NAN),
+                manifest.metrics["validation"]["step"],
                 evaluations.collect::<String>(),
-                run_dir.display(),
+                shell_path(&run_dir),
             ))
         }
         TrainingOutcome::Interrupted { stage, step } => Err(CliError::Interrupted(format!(

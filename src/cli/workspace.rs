@@ -130,6 +130,15 @@ impl Workspace {
     }
 }
 
+/// The name of a data set that was given with `--name`. Errors: `Usage` if it is not valid.
+pub(super) fn dataset_name(name: &str) -> Result<DatasetName, CliError> {
+    name.parse().map_err(|_| {
+        CliError::Usage(format!(
+            "--name is {name:?}; a name has 1 to 64 characters of a to z, 0 to 9 and -, and does not start with -"
+        ))
+    })
+}
+
 /// The scenario that the model was trained on: the default name of its data set.
 pub(super) fn trained_on(loaded: &Model) -> Result<PathBuf, CliError> {
     let manifest = &loaded.manifest;

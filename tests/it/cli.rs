@@ -81,8 +81,8 @@ fn usage_errors_exit_with_2_and_advice() {
             "noise_std is NaN; it must be a finite number from 0 to 1",
         ),
         (
-            "collect --trials 4 --frame-size 8",
-            "trials: 3 in the directory, 4 requested",
+            "collect --trials 2 --frame-size 8",
+            "trials: 3 in the directory, 2 requested",
         ),
         (
             "collect --out thesis",
@@ -455,8 +455,21 @@ fn the_next_step_of_a_small_collection_works() {
     }
     let printed = succeed(dir.path(), "collect --trials 2 --frame-size 8 --out tiny");
     assert!(
-        printed.contains("next: collect more trials into another directory"),
+        printed.contains("next: the same command with --trials 40, which adds trials"),
         "{printed}"
+    );
+}
+
+#[test]
+fn a_named_collection_grows() {
+    let dir = tempfile::tempdir().unwrap();
+    succeed(dir.path(), "collect --trials 2 --frame-size 8 --name small");
+    let printed = succeed(dir.path(), "collect --trials 4 --frame-size 8 --name small");
+    assert!(printed.starts_with("data/datasets/small: 4 trials, "), "{printed}");
+    let (code, text) = run(dir.path(), "collect --name My_Set");
+    assert!(
+        code == 2 && text.contains("--name is \"My_Set\"; a name has 1 to 64 characters"),
+        "{text}"
     );
 }
 

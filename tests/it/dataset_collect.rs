@@ -242,17 +242,30 @@ fn collecting_a_finished_data_set_again_does_nothing() {
 fn resuming_with_other_arguments_is_refused() {
     let (_directory, out) = finished();
     let other = CollectConfig {
-        trials: 12,
+        trials: 10,
         ..config(&out)
     };
     let message = run(&other).unwrap_err().to_string();
     assert!(
         message.ends_with(
-            "holds a collection with other arguments (trials: 11 in the directory, 12 requested); use the same arguments to \
+            "holds a collection with other arguments (trials: 11 in the directory, 10 requested); use the same arguments to \
              resume it, or use another directory"
         ),
         "{message}"
     );
+}
+
+#[test]
+fn more_trials_extend_a_collection_to_the_same_bytes() {
+    let (directory, out) = finished();
+    let more = |out: &Path| CollectConfig {
+        trials: TRIALS + 6,
+        ..config(out)
+    };
+    assert_eq!(run(&more(&out)).unwrap().episode_count as u64, TRIALS + 6);
+    let whole = directory.path().join("whole");
+    run(&more(&whole)).unwrap();
+    assert!(contents(&out) == contents(&whole), "the extended data set differs");
 }
 
 #[test]

@@ -111,6 +111,51 @@ fn a_donkeycar_tub_leaves_out_deleted_records() {
 }
 
 #[test]
+fn a_tub_of_deleted_records_is_imported_if_asked_for() {
+    let dir = tempfile::tempdir().unwrap();
+    let (source, out) = (tub(dir.path()), dir.path().join("sets/out"));
+    let some = run(&source, &dir.path().join("some"), small()).unwrap();
+    assert_eq!(
+        some.notes,
+        ["1 records are marked as deleted and were left out; --include-deleted imports them, too"]
+    );
+    let manifest = fs::read_to_string(source.join("manifest.json")).unwrap();
+    let all = manifest.replace("[9]", "[0,1,2,3,4,5,6,7,8,9]");
+    fs::write(source.join("manifest.json"), all).unwrap();
+    let error = run(&source, &out, small()).unwrap_err().to_string();
+    assert!(error.starts_with("10 of the 10 records of "), "{error}");
+    assert!(error.ends_with("--include-deleted imports them, too"), "{error}");
+    assert!(!dir.path().join("sets").exists(), "a failed import leaves nothing");
+    let options = ImportOptions {
+        include_deleted: true,
+        ..small()
+    };
+    let imported = run(&source, &out, options).unwrap();
+    assert_eq!((imported.info.frame_count, imported.info.name.as_str()), (10, "out"));
+}
+
+#[test]
+fn columns_that_nobody_asked_for_are_named() {
+    let dir = tempfile::tempdir().unwrap();
+    let source = folder(dir.path());
+    let csv = source.join("log.csv");
+    let text = fs::read_to_string(&csv)
+        .unwrap()
+        .replace("action.", "")
+        .replace("state.", "");
+    fs::write(&csv, text).unwrap();
+    let imported = run(&source, &dir.path().join("frames"), small()).unwrap();
+    assert_eq!(imported.notes.len(), 1);
+    let named = imported.notes[0].contains("not imported: speed") && imported.notes[0].contains("--action COLUMN");
+    assert!(named, "{:?}", imported.notes);
+    let options = ImportOptions {
+        actions: vec!["speed".to_owned()],
+        ..small()
+    };
+    assert_eq!(run(&source, &dir.path().join("speed"), options).unwrap().notes, [""; 0]);
+}
+
+#[test]
 fn a_numpy_array_of_sequences_becomes_episodes() {
     let dir = tempfile::tempdir().unwrap();
     let source = dir.path().join("moving.npy");

@@ -36,11 +36,11 @@ fn killed_and_unbroken_are_equal(source: &str, options: &[&str], write: impl Fn(
     let dir = tempfile::tempdir().unwrap();
     write(&dir.path().join(source));
     let began = Instant::now();
-    finish(start(dir.path(), source, "whole", options));
+    finish(start(dir.path(), source, "whole/set", options));
     let took = began.elapsed();
     let (mut rng, mut share, mut landed) = (Seed(source.len() as u64).rng(), 1.0, 0);
     while landed < KILLS {
-        let mut child = start(dir.path(), source, "killed", options);
+        let mut child = start(dir.path(), source, "killed/set", options);
         std::thread::sleep(took.mul_f64(share * rng.random_range(0.05..1.0)));
         if child.try_wait().unwrap().is_none() {
             // On Unix this is SIGKILL.
@@ -58,7 +58,7 @@ fn killed_and_unbroken_are_equal(source: &str, options: &[&str], write: impl Fn(
             fs::remove_dir_all(dir.path().join("killed")).unwrap();
         }
     }
-    finish(start(dir.path(), source, "killed", options));
+    finish(start(dir.path(), source, "killed/set", options));
     let (whole, killed) = (
         contents(&dir.path().join("whole")),
         contents(&dir.path().join("killed")),
@@ -72,7 +72,7 @@ fn killed_and_unbroken_are_equal(source: &str, options: &[&str], write: impl Fn(
         assert!(killed[path] == *bytes, "{source}: {} differs", path.display());
     }
     // An import that is complete is left as it is.
-    finish(start(dir.path(), source, "killed", options));
+    finish(start(dir.path(), source, "killed/set", options));
     assert!(
         contents(&dir.path().join("killed")) == killed,
         "{source}: a complete import was changed"
@@ -128,9 +128,13 @@ fn a_directory_with_half_a_first_file_is_unused() {
     let dir = tempfile::tempdir().unwrap();
     recordings::images_with_csv(&dir.path().join("images"), 20);
     // What a kill during the very first write leaves.
-    fs::create_dir_all(dir.path().join("out/meta")).unwrap();
-    fs::write(dir.path().join("out/meta/import.json.0123456789abcdef.partial"), "{").unwrap();
-    finish(start(dir.path(), "images", "out", &[]));
-    finish(start(dir.path(), "images", "whole", &[]));
+    fs::create_dir_all(dir.path().join("out/set/meta")).unwrap();
+    fs::write(
+        dir.path().join("out/set/meta/import.json.0123456789abcdef.partial"),
+        "{",
+    )
+    .unwrap();
+    finish(start(dir.path(), "images", "out/set", &[]));
+    finish(start(dir.path(), "images", "whole/set", &[]));
     assert_eq!(contents(&dir.path().join("out")), contents(&dir.path().join("whole")));
 }

@@ -54,6 +54,7 @@ mod mixture;
 mod model_cards;
 mod moving_mnist;
 mod msgpack;
+mod next_commands;
 mod nn_cell;
 mod nn_fixtures;
 mod nn_flow;

@@ -6,6 +6,7 @@
 
 mod config;
 mod digits;
+mod extend;
 pub mod moving_mnist;
 mod status;
 mod unfinished;
@@ -23,8 +24,8 @@ use super::store::writer::ShardWriter;
 use super::{DatasetError, DatasetInfo, EpisodeData};
 use foreframe_sim::{Observation, SimError, World, action_channels};
 
-/// Collects a data set, or resumes an unfinished one with the same arguments. Returns at once if it is already finished
-/// ([`CollectionStatus::of`] tells). Several threads call `on_progress`.
+/// Collects a data set, or resumes an unfinished one with the same arguments. A directory that holds the same collection with
+/// fewer trials gets the others. Returns at once if it is already finished ([`CollectionStatus::of`] tells). Several threads call `on_progress`.
 /// Errors: `Usage`, `World`, `OutExists`, `OtherArguments`, `Busy`, `Cancelled`, `Simulation`, `Io`.
 pub fn collect(
     config: &CollectConfig,
@@ -32,6 +33,7 @@ pub fn collect(
     cancelled: &AtomicBool,
 ) -> Result<DatasetInfo, DatasetError> {
     config.validate()?;
+    extend::extend(config)?;
     if let CollectionStatus::Finished(info) = CollectionStatus::of(config)? {
         return Ok(*info);
     }

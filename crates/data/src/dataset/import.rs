@@ -34,6 +34,7 @@ pub use self::options::{DEFAULT_DISK_MIB, DEFAULT_MAX_FILES, ImportConfig, Impor
 use self::recording::Recording;
 pub use self::skipped::SkippedItem;
 use self::skipped::listed;
+use self::timing::ImportPlan;
 pub use self::writer::{ImportProgress, Imported, saved_shards};
 use foreframe_core::types::Channel;
 
@@ -44,7 +45,7 @@ pub fn check_out(config: &ImportConfig) -> Result<(), ImportError> {
 }
 
 /// Imports a recording, or continues an import that was stopped; the result has the same bytes either way. Returns at once
-/// if the data set is complete. Errors: every [`ImportError`].
+/// if the data set is complete. An import that fails before its first shard leaves nothing. Errors: every [`ImportError`].
 pub fn import(
     config: &ImportConfig,
     on_progress: &(dyn Fn(ImportProgress) + Sync),
@@ -56,14 +57,27 @@ pub fn import(
     if let Some(finished) = directory.finished()? {
         return Ok(finished);
     }
-    // Its images are read while the data set is written.
-    let source = UnpackedSource::of(config, cancelled)?;
-    let recording = open(&source.path, config, cancelled)?;
+    let write = || {
+        // Its images are read while the data set is written.
+        let source = UnpackedSource::of(config, cancelled)?;
+        directory.write(&plan(&source.path, config, cancelled)?, on_progress, cancelled)
+    };
+    let imported = write();
+    if imported.is_err() {
+        directory.discard();
+    }
+    imported
+}
+
+/// Reads what is to be written. Errors: those of the source, `Option`, `Record`, `Empty`, `Stopped`.
+fn plan(source: &Path, config: &ImportConfig, cancelled: &AtomicBool) -> Result<ImportPlan, ImportError> {
+    let options = &config.options;
+    let recording = open(source, config, cancelled)?;
     check_channels(&recording)?;
     check_units(options, &recording)?;
     let mut plan = timing::plan(recording, options)?;
     camera::describe(&mut plan, options, cancelled)?;
-    directory.write(&plan, on_progress, cancelled)
+    Ok(plan)
 }
 
 /// Errors: `Option` if two components of the action or of the state have the same name.

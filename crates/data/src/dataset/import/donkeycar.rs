@@ -113,6 +113,7 @@ pub(super) fn open(tub: &Path, options: &ImportOptions) -> Result<Recording, Imp
         states: manifest.named(&options.states, "--state")?,
     };
     let (mut records, mut paths, mut skipped) = (Vec::new(), Vec::new(), SkippedList::default());
+    let mut marked = 0;
     for catalog in &manifest.catalogs {
         let path = inside(tub, catalog, &tub.join(MANIFEST).display().to_string())?;
         let file = open_file(&path)?;
@@ -124,7 +125,7 @@ pub(super) fn open(tub: &Path, options: &ImportOptions) -> Result<Recording, Imp
                 .map_err(|reason| ImportError::record(&place, reason))
                 .and_then(|line| reader.record(&line, &place));
             match parsed {
-                Ok((index, _, _)) if manifest.deleted.contains(&index) => {}
+                Ok((index, _, _)) if !options.include_deleted && manifest.deleted.contains(&index) => marked += 1,
                 Ok((_, image, record)) => {
                     records.push(record);
                     paths.push(image);
@@ -133,14 +134,32 @@ pub(super) fn open(tub: &Path, options: &ImportOptions) -> Result<Recording, Imp
             }
         }
     }
+    let notes = note_on_deleted(tub, marked, records.len())?;
     // `user/angle` becomes `angle`.
     let channel = |name: &String| options.channel(name.rsplit('/').next().unwrap_or(name), "");
     Ok(Recording {
         action_channels: reader.actions.iter().map(channel).collect(),
         state_channels: reader.states.iter().map(channel).collect(),
         skipped,
+        notes,
         ..Recording::new(folder_name(tub, "tub"), records, ImageFiles(paths))
     })
+}
+
+/// What is said about records that are marked as deleted. Errors: `Option` if the others are too few.
+fn note_on_deleted(tub: &Path, marked: usize, kept: usize) -> Result<Vec<String>, ImportError> {
+    match (marked, kept) {
+        (0, _) => Ok(Vec::new()),
+        (_, 0 | 1) => Err(ImportError::Option(format!(
+            "{marked} of the {} records of {} are marked as deleted in {MANIFEST}, so that no two consecutive frames are left; \
+             --include-deleted imports them, too",
+            marked + kept,
+            tub.display()
+        ))),
+        _ => Ok(vec![format!(
+            "{marked} records are marked as deleted and were left out; --include-deleted imports them, too"
+        )]),
+    }
 }
 
 /// The next line, or why it cannot be read; `None` at the end.

@@ -106,6 +106,7 @@ fn with_csv(folder: &Path, csv: &Path, options: &ImportOptions) -> Result<Record
         action_channels: header.channels(&columns.actions),
         state_channels: header.channels(&columns.states),
         skipped,
+        notes: header.note_on_unused(&columns),
         ..Recording::new(stem(folder, "recording"), records, ImageFiles(paths))
     })
 }
@@ -257,6 +258,27 @@ impl Header<'_> {
             actions: self.chosen(&options.actions, "action")?,
             states: self.chosen(&options.states, "state")?,
         })
+    }
+
+    /// What is said about columns that nobody asked for, where no column was named.
+    fn note_on_unused(&self, columns: &Columns) -> Vec<String> {
+        let options = self.options;
+        let time = columns.time.map(|(column, _)| column);
+        let is_used = |column: &usize| {
+            let (column, chosen) = (*column, columns.actions.iter().chain(&columns.states));
+            column == columns.file || Some(column) == time || chosen.copied().any(|used| used == column)
+        };
+        let unused = (0..self.names.len()).filter(|column| !is_used(column));
+        let names: Vec<&str> = unused.map(|column| name_and_unit(&self.names[column]).0).collect();
+        if names.is_empty() || !options.actions.is_empty() || !options.states.is_empty() {
+            return Vec::new();
+        }
+        vec![format!(
+            "columns of {} that were not imported: {}; to import one, name it as a component of the action (what the robot was \
+             told) with --action COLUMN, or of the state (what it measured) with --state COLUMN",
+            self.csv.display(),
+            listed(names.iter().map(|name| name.escape_debug().to_string()))
+        )]
     }
 
     fn channels(&self, columns: &[usize]) -> Vec<Channel> {

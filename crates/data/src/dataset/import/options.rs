@@ -96,6 +96,10 @@ pub struct ImportOptions {
     /// Leave out what is damaged and list it, instead of stopping there
     #[cfg_attr(feature = "cli", arg(long))]
     pub skip_bad: bool,
+    /// Import the records of a Donkeycar tub that are marked as deleted, too
+    #[cfg_attr(feature = "cli", arg(long))]
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub include_deleted: bool,
 }
 
 impl Default for ImportOptions {
@@ -117,6 +121,7 @@ impl Default for ImportOptions {
             tilt_deg: None,
             camera_height_m: None,
             skip_bad: false,
+            include_deleted: false,
         }
     }
 }

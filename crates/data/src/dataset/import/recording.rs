@@ -34,6 +34,8 @@ pub(super) struct Recording {
     pub(super) records: Vec<Record>,
     pub(super) images: Box<dyn ImageSource>,
     pub(super) skipped: SkippedList,
+    /// What is there but was not asked for, in sentences for the user.
+    pub(super) notes: Vec<String>,
 }
 
 impl Recording {
@@ -50,6 +52,7 @@ impl Recording {
             records,
             images: Box::new(images),
             skipped: SkippedList::default(),
+            notes: Vec::new(),
         }
     }
 }

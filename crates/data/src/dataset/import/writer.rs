@@ -35,6 +35,8 @@ pub struct Imported {
     pub info: DatasetInfo,
     /// What was left out. The last entry can stand for all that are not listed.
     pub skipped: Vec<SkippedItem>,
+    /// What is in the source but was not asked for, and how to import it, in sentences; empty if the data set was complete before.
+    pub notes: Vec<String>,
 }
 
 impl Imported {
@@ -65,6 +67,8 @@ struct ImportArguments<'a> {
 /// The directory of an import, locked by this process.
 pub(super) struct Directory<'a> {
     config: &'a ImportConfig,
+    /// It and those above it that did not exist before, the innermost first.
+    made: Vec<PathBuf>,
     _lock: File,
 }
 
@@ -73,6 +77,10 @@ impl<'a> Directory<'a> {
     pub(super) fn claim(config: &'a ImportConfig) -> Result<Self, ImportError> {
         let out = &config.out;
         let path = out.join(IMPORT_ARGUMENTS);
+        let made = out
+            .ancestors()
+            .take_while(|path| !path.exists() && path.parent().is_some());
+        let made = made.map(Path::to_owned).collect();
         // The file may be replaced, so the old one is locked first: another import may still use it.
         let old = path.is_file().then(|| lock_file(&path, out)).transpose()?;
         let lock = match (Self::check(config)?, old) {
@@ -85,7 +93,11 @@ impl<'a> Directory<'a> {
             }
         };
         remove_partials(out);
-        Ok(Self { config, _lock: lock })
+        Ok(Self {
+            config,
+            made,
+            _lock: lock,
+        })
     }
 
     /// Whether the directory can be taken. Returns the arguments that must be written to it; `None` if it has them already.
@@ -129,7 +141,23 @@ impl<'a> Directory<'a> {
         Ok(Some(Imported {
             info: DatasetMetadata::read(out)?.info_in(out)?,
             skipped: self.read_skipped()?.into_iter().map(|(_, item)| item).collect(),
+            notes: Vec::new(),
         }))
+    }
+
+    /// Removes what a failed import wrote, unless a whole shard is saved, after which the same import continues.
+    pub(super) fn discard(self) {
+        let out = &self.config.out;
+        if saved_shards(out) > 0 {
+            return;
+        }
+        // What cannot be removed does not hide why the import failed, nor stop the next one.
+        for part in ["data", "meta"] {
+            let _ = fs::remove_dir_all(out.join(part));
+        }
+        for directory in &self.made {
+            let _ = fs::remove_dir(directory);
+        }
     }
 
     fn skipped_path(&self) -> PathBuf {
@@ -199,6 +227,7 @@ impl<'a> Directory<'a> {
         Ok(Imported {
             info,
             skipped: all.into_iter().map(|(_, item)| item).collect(),
+            notes: plan.recording.notes.clone(),
         })
     }
 
@@ -217,8 +246,13 @@ pub fn saved_shards(out: &Path) -> usize {
 }
 
 fn description(config: &ImportConfig, plan: &ImportPlan) -> DatasetInfo {
+    // The name under which users find it; the source's own if the directory has none, as `..` has not.
+    let directory = config.out.file_name();
     DatasetInfo {
-        name: plan.recording.name.clone(),
+        name: directory.map_or_else(
+            || plan.recording.name.clone(),
+            |name| name.to_string_lossy().into_owned(),
+        ),
         frame_width_px: config.options.frame_width_px,
         frame_height_px: config.options.frame_height_px,
         frame_period_s: plan.frame_period_s,

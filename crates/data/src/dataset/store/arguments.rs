@@ -61,7 +61,8 @@ pub(crate) fn lock_file(path: &Path, out: &Path) -> Result<File, DatasetError> {
     }
 }
 
-fn read_arguments(out: &Path) -> Result<Option<String>, DatasetError> {
+/// The arguments that a directory was begun with, if it was. Errors: `Io`.
+pub(crate) fn read_arguments(out: &Path) -> Result<Option<String>, DatasetError> {
     let path = out.join(ARGUMENTS);
     match fs::read_to_string(&path) {
         Ok(text) => Ok(Some(text)),

@@ -56,6 +56,7 @@ impl Pipeline {
         let on_progress = |now: ImportProgress| report.progress(now.done, now.total, "importing");
         // After an error it continues with the shards that are finished.
         let imported = retry.repeat_once_free(|| import(&config, &on_progress, cancelled))?;
+        imported.notes.iter().for_each(|note| report.line(note.clone()));
         log_skipped(&imported, report);
         let mut result = self.finish_dataset(&spec.name, &imported.info, &retry)?;
         result["skipped"] = imported.skipped_count().into();

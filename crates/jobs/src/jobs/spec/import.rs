@@ -85,6 +85,9 @@ pub struct ImportSpec {
     /// Leaves out what is damaged and lists it in the job's log, instead of stopping there.
     #[serde(default)]
     pub skip_bad: bool,
+    /// Imports the records of a Donkeycar tub that are marked as deleted, too.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub include_deleted: bool,
 }
 
 fn default_size() -> String {
@@ -190,6 +193,7 @@ impl ImportSpec {
             tilt_deg: self.tilt,
             camera_height_m: self.camera_height,
             skip_bad: self.skip_bad,
+            include_deleted: self.include_deleted,
         };
         match options.validate() {
             Ok(()) => Ok(options),
