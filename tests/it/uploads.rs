@@ -69,7 +69,7 @@ async fn an_uploaded_archive_becomes_a_data_set_and_is_deleted() {
         poll_until(async || is_empty(&uploads).then_some(())).await;
     }
     let set = get(&app, "/v1/datasets/walk").await.json();
-    assert_eq!((&set["frames"], &set["title"]), (&json!(12), &json!("My walk")));
+    assert_eq!((&set["frames"], &set["title"]), (&json!(12), &json!("walk")));
     assert!(!data.join("datasets/walk/.unpacked").exists());
 }
 

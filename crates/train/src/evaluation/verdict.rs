@@ -24,7 +24,9 @@ impl SetScores {
         if self.intervals_are_reliable {
             return verdict;
         }
-        format!("{verdict}; {} are too few to be sure", self.groups())
+        let is_one = self.trials.or(self.blocks) == Some(1);
+        let are = if is_one { "is" } else { "are" };
+        format!("{verdict}; {} {are} too few to be sure", self.groups())
     }
 
     /// What the windows come from: `12 trials`, `3 blocks`.
