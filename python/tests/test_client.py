@@ -66,6 +66,20 @@ def test_a_model_that_estimates_depth_reads_the_state_at_each_frame(client: fore
         assert np.abs(frames.astype(int) - answer.prediction.frames).max() <= 1
 
 
+def test_another_camera_gives_another_prediction(client: foreframe.Client, drive: Drive) -> None:
+    wide = foreframe.Camera(horizontal_fov_rad=1.6, tilt_down_rad=0.3, height_m=0.2)
+    options = {"states": drive.states[:5], "plan": drive.actions[4:9]}
+    own, other = (client.predict("rooms", drive.frames[:5], camera=camera, **options) for camera in (None, wide))
+    assert not np.array_equal(own.frames, other.frames)
+    with client.session("rooms", camera=wide) as session:
+        for n in range(5):
+            answer = session.step(drive.frames[n], action=drive.actions[n], state=drive.states[n], plan=options["plan"])
+    assert answer.prediction is not None
+    assert np.abs(other.frames.astype(int) - answer.prediction.frames).max() <= 1
+    with pytest.raises(foreframe.ApiError, match="field of view"):
+        client.predict("rooms", drive.frames[:5], camera=foreframe.Camera(9.0, 0.0), **options)
+
+
 def test_a_png_is_read_as_it_was_written(drive: Drive) -> None:
     assert np.array_equal(decode_png(encode_png(drive.frames[0])), drive.frames[0])
 

@@ -12,7 +12,7 @@ from .errors import (
     StreamError,
     Unavailable,
 )
-from .records import Answer, Channel, Dataset, Job, LogLine, Model, Prediction, Rollouts, Spec
+from .records import Answer, Camera, Channel, Dataset, Job, LogLine, Model, Prediction, Rollouts, Spec
 from .server import Server, serve
 from .session import AsyncSession, Session
 
@@ -21,6 +21,7 @@ __all__ = [
     "ApiError",
     "AsyncClient",
     "AsyncSession",
+    "Camera",
     "Channel",
     "Client",
     "ConnectionFailed",

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .images import FrameLike, encode_all
-from .records import Dataset, Job, LogLine, Model, Prediction, Rollouts, Spec
+from .records import Camera, Dataset, Job, LogLine, Model, Prediction, Rollouts, Spec
 
 T = TypeVar("T")
 
@@ -102,6 +102,7 @@ def predict(
     plan: Vectors | None,
     steps: int | None,
     resize: str | None,
+    camera: Camera | None,
 ) -> Call[Prediction]:
     image_format, images = encode_all(frames, spec.size)
     body = given(
@@ -113,6 +114,7 @@ def predict(
         plan=numbers(plan),
         steps=steps,
         resize=resize,
+        camera=camera and camera.body(),
     )
     read = partial(Prediction.of, size=spec.size)
     return Call("POST", path("models", name, "predict"), read, body, is_binary=True)
@@ -128,6 +130,7 @@ def rollouts(
     states: Vectors | None,
     steps: int | None,
     resize: str | None,
+    camera: Camera | None,
 ) -> Call[Rollouts]:
     image_format, images = encode_all(frames, spec.size)
     body = given(
@@ -138,6 +141,7 @@ def rollouts(
         states=numbers(states),
         steps=steps,
         resize=resize,
+        camera=camera and camera.body(),
     )
     read = partial(Rollouts.of, size=spec.size)
     return Call("POST", path("models", name, "rollouts"), read, body, is_binary=True)
@@ -151,8 +155,9 @@ def session_rollouts(
     return Call("POST", path("sessions", session, "rollouts"), read, body, headers=headers, is_binary=True)
 
 
-def create_session(model_name: str, resize: str | None) -> Call[Mapping[str, Any]]:
-    return Call("POST", path("sessions"), dict, given(model=model_name, format="raw", resize=resize))
+def create_session(model_name: str, resize: str | None, camera: Camera | None) -> Call[Mapping[str, Any]]:
+    body = given(model=model_name, format="raw", resize=resize, camera=camera and camera.body())
+    return Call("POST", path("sessions"), dict, body)
 
 
 def delete_session(session: str, token: str) -> Call[None]:

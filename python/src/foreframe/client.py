@@ -20,7 +20,7 @@ from .errors import ConnectionFailed, JobFailed, api_error
 from .events import EventReader
 from .flow import follow, follow_async
 from .images import FrameLike
-from .records import Dataset, Job, LogLine, Model, Predicted, Prediction, Rollouts, Spec
+from .records import Camera, Dataset, Job, LogLine, Model, Predicted, Prediction, Rollouts, Spec
 from .session import AsyncSession, Session
 
 T = TypeVar("T")
@@ -139,12 +139,14 @@ class Client:
         plan: Vectors | None = None,
         steps: int | None = None,
         resize: str | None = None,
+        camera: Camera | None = None,
     ) -> Prediction:
         """Predicts the frames after ``frames``, the model's context, oldest first.
 
         ``plan``: the future actions; without it, the last of ``actions`` is repeated. ``state``: at the last frame.
         ``states``: at each of ``frames``, instead of ``state``; a model that estimates depth reads all of them. ``resize``:
-        ``crop``, ``letterbox`` or ``stretch``, for frames of another size.
+        ``crop``, ``letterbox`` or ``stretch``, for frames of another size. ``camera``: where it is not the model's own, for a
+        model that estimates depth.
         """
         call = partial(
             calls.predict,
@@ -156,6 +158,7 @@ class Client:
             plan=plan,
             steps=steps,
             resize=resize,
+            camera=camera,
         )
         return self._follow(self._specs.predicted(model, call))
 
@@ -169,16 +172,27 @@ class Client:
         states: Vectors | None = None,
         steps: int | None = None,
         resize: str | None = None,
+        camera: Camera | None = None,
     ) -> Rollouts:
         """Predicts the frames of each of ``plans`` ``[plans, steps, action]`` from one context."""
         call = partial(
-            calls.rollouts, model, frames=frames, plans=plans, state=state, states=states, steps=steps, resize=resize
+            calls.rollouts,
+            model,
+            frames=frames,
+            plans=plans,
+            state=state,
+            states=states,
+            steps=steps,
+            resize=resize,
+            camera=camera,
         )
         return self._follow(self._specs.predicted(model, call))
 
-    def session(self, model: str, *, resize: str | None = None, reconnect_s: float = 30.0) -> Session:
+    def session(
+        self, model: str, *, resize: str | None = None, camera: Camera | None = None, reconnect_s: float = 30.0
+    ) -> Session:
         """A session: send frame after frame, get a prediction after each. See :class:`Session`."""
-        return Session(self, model, resize=resize, reconnect_s=reconnect_s)
+        return Session(self, model, resize=resize, camera=camera, reconnect_s=reconnect_s)
 
     def models(self) -> list[Model]:
         """All models."""
@@ -368,6 +382,7 @@ class AsyncClient:
         plan: Vectors | None = None,
         steps: int | None = None,
         resize: str | None = None,
+        camera: Camera | None = None,
     ) -> Prediction:
         """As :meth:`Client.predict`."""
         call = partial(
@@ -380,6 +395,7 @@ class AsyncClient:
             plan=plan,
             steps=steps,
             resize=resize,
+            camera=camera,
         )
         return await self._follow(self._specs.predicted(model, call))
 
@@ -393,16 +409,27 @@ class AsyncClient:
         states: Vectors | None = None,
         steps: int | None = None,
         resize: str | None = None,
+        camera: Camera | None = None,
     ) -> Rollouts:
         """As :meth:`Client.rollouts`."""
         call = partial(
-            calls.rollouts, model, frames=frames, plans=plans, state=state, states=states, steps=steps, resize=resize
+            calls.rollouts,
+            model,
+            frames=frames,
+            plans=plans,
+            state=state,
+            states=states,
+            steps=steps,
+            resize=resize,
+            camera=camera,
         )
         return await self._follow(self._specs.predicted(model, call))
 
-    def session(self, model: str, *, resize: str | None = None, reconnect_s: float = 30.0) -> AsyncSession:
+    def session(
+        self, model: str, *, resize: str | None = None, camera: Camera | None = None, reconnect_s: float = 30.0
+    ) -> AsyncSession:
         """As :meth:`Client.session`."""
-        return AsyncSession(self, model, resize=resize, reconnect_s=reconnect_s)
+        return AsyncSession(self, model, resize=resize, camera=camera, reconnect_s=reconnect_s)
 
     async def models(self) -> list[Model]:
         """All models."""

@@ -32,6 +32,21 @@ class Channel:
 
 
 @dataclass(frozen=True)
+class Camera:
+    """A pinhole camera with square pixels that looks ahead of the robot, tilted down."""
+
+    #: Angle between the left and the right edge of the image, in radians.
+    horizontal_fov_rad: float
+    tilt_down_rad: float
+    #: Height above the floor, in metres, if it is known.
+    height_m: float | None = None
+
+    def body(self) -> dict[str, float]:
+        """As the server reads it."""
+        return {name: value for name, value in vars(self).items() if value is not None}
+
+
+@dataclass(frozen=True)
 class Spec:
     """What a model takes and gives."""
 

@@ -16,7 +16,7 @@ from .calls import Call, Plans, Vector, Vectors, authorization
 from .errors import ApiError, ForeframeError, api_error
 from .flow import follow, follow_async
 from .images import FrameLike
-from .records import Answer, Rollouts, Spec
+from .records import Answer, Camera, Rollouts, Spec
 from .stream import SUBPROTOCOL, Broken, Flow, Open, Operation, Pause, Receive, Send, SessionFlow, Shut
 
 if TYPE_CHECKING:
@@ -56,9 +56,17 @@ class Session:
     thread at a time, as a context manager: ``with client.session("moving-flow") as session: …``
     """
 
-    def __init__(self, client: Client, model: str, *, resize: str | None = None, reconnect_s: float = 30.0) -> None:
+    def __init__(
+        self,
+        client: Client,
+        model: str,
+        *,
+        resize: str | None = None,
+        camera: Camera | None = None,
+        reconnect_s: float = 30.0,
+    ) -> None:
         self._client = client
-        self._flow = SessionFlow(model, resize, reconnect_s)
+        self._flow = SessionFlow(model, resize, camera, reconnect_s)
         self._socket: websockets.sync.client.ClientConnection | None = None
 
     @property
@@ -146,9 +154,17 @@ class Session:
 class AsyncSession:
     """As :class:`Session`, with coroutines."""
 
-    def __init__(self, client: AsyncClient, model: str, *, resize: str | None = None, reconnect_s: float = 30.0) -> None:
+    def __init__(
+        self,
+        client: AsyncClient,
+        model: str,
+        *,
+        resize: str | None = None,
+        camera: Camera | None = None,
+        reconnect_s: float = 30.0,
+    ) -> None:
         self._client = client
-        self._flow = SessionFlow(model, resize, reconnect_s)
+        self._flow = SessionFlow(model, resize, camera, reconnect_s)
         self._socket: websockets.asyncio.client.ClientConnection | None = None
 
     @property

@@ -15,7 +15,7 @@ from . import calls
 from .calls import Call, Plans, Vector, Vectors, given, numbers
 from .errors import ApiError, ConnectionFailed, StreamClosed, StreamError, Unavailable
 from .images import FrameLike, encode
-from .records import Answer, Prediction, Rollouts, Spec
+from .records import Answer, Camera, Prediction, Rollouts, Spec
 
 T = TypeVar("T")
 
@@ -78,13 +78,14 @@ class SessionFlow:
     is the same. Frames are numbered by ``seq``, which counts on; the server's own numbers begin at 0 in each new session.
     """
 
-    def __init__(self, model: str, resize: str | None, reconnect_s: float) -> None:
+    def __init__(self, model: str, resize: str | None, camera: Camera | None, reconnect_s: float) -> None:
         self.spec: Spec | None = None
         self.version = 0
         #: Which frame is the next.
         self.next_seq = 0
         self._model = model
         self._resize = resize
+        self._camera = camera
         self._reconnect_s = reconnect_s
         self._id = ""
         self._token = ""
@@ -227,7 +228,7 @@ class SessionFlow:
     def _begin(self) -> Flow[None]:
         """Opens a new session, and sends the context again."""
         try:
-            created = yield calls.create_session(self._model, self._resize)
+            created = yield calls.create_session(self._model, self._resize, self._camera)
         except Unavailable as error:
             raise Broken(error.detail, error.retry_after_s) from error
         except ConnectionFailed as error:
