@@ -24,6 +24,7 @@ mod serve;
 mod state;
 mod stream;
 mod token;
+mod world_session;
 
 pub use admin::serve_worker_health;
 pub use config::{ServerConfig, SettingError};

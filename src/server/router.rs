@@ -18,7 +18,7 @@ use super::http::requests;
 use super::openapi;
 use super::routes::{
     audit, datasets, environments, episodes, events, health, inference_protocol, job_events, jobs, metrics, models,
-    openpi, pages, predict, preview, rollouts, sessions, streams,
+    openenv, openpi, pages, predict, preview, rollouts, sessions, streams, world_sessions,
 };
 use super::state::App;
 
@@ -79,6 +79,8 @@ fn request_routes(config: &ServerConfig) -> OpenApiRouter<App> {
         .merge(datasets::routes())
         .merge(episodes::routes())
         .merge(environments::routes())
+        .merge(world_sessions::routes())
+        .merge(openenv::routes())
         .merge(audit::routes())
         .merge(inference_protocol::routes())
 }
@@ -88,6 +90,7 @@ fn stream_routes() -> OpenApiRouter<App> {
     OpenApiRouter::new()
         .merge(streams::routes())
         .merge(openpi::routes())
+        .merge(openenv::stream_routes())
         .merge(job_events::routes())
         .merge(events::routes())
 }

@@ -11,6 +11,7 @@ pub(super) mod job_events;
 pub(super) mod jobs;
 pub(super) mod metrics;
 pub(super) mod models;
+pub(super) mod openenv;
 pub(super) mod openpi;
 pub(super) mod pages;
 pub(super) mod predict;
@@ -18,6 +19,7 @@ pub(super) mod preview;
 pub(super) mod rollouts;
 pub(super) mod sessions;
 pub(super) mod streams;
+pub(super) mod world_sessions;
 
 mod bounds;
 mod picture;

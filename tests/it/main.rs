@@ -59,6 +59,7 @@ mod nn_optimizer;
 mod nn_reference;
 mod nn_spec;
 #[cfg(feature = "otlp")]
+mod openenv;
 mod openpi;
 mod otlp;
 mod overload;
@@ -98,3 +99,4 @@ mod stream_accuracy;
 mod tls;
 mod training;
 mod warp;
+mod world_sessions;
