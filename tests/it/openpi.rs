@@ -22,7 +22,7 @@ use crate::service::{
 #[derive(Debug, Deserialize, PartialEq)]
 struct Array {
     #[serde(rename = "__ndarray__")]
-    is_array: bool,
+    is_numpy: bool,
     data: ImageBytes,
     dtype: String,
     shape: Vec<usize>,
@@ -33,7 +33,7 @@ impl Serialize for Array {
         use serde::ser::SerializeMap as _;
         let key = |name: &str| ImageBytes(name.as_bytes().to_vec());
         let mut map = serializer.serialize_map(Some(4))?;
-        map.serialize_entry(&key("__ndarray__"), &self.is_array)?;
+        map.serialize_entry(&key("__ndarray__"), &self.is_numpy)?;
         map.serialize_entry(&key("data"), &self.data)?;
         map.serialize_entry(&key("dtype"), &self.dtype)?;
         map.serialize_entry(&key("shape"), &self.shape)?;
@@ -43,7 +43,7 @@ impl Serialize for Array {
 
 fn bytes(shape: &[usize], data: Vec<u8>) -> Array {
     Array {
-        is_array: true,
+        is_numpy: true,
         data: ImageBytes(data),
         dtype: "|u1".to_owned(),
         shape: shape.to_vec(),
@@ -52,7 +52,7 @@ fn bytes(shape: &[usize], data: Vec<u8>) -> Array {
 
 fn doubles(shape: &[usize], values: &[f64]) -> Array {
     Array {
-        is_array: true,
+        is_numpy: true,
         data: ImageBytes(values.iter().flat_map(|value| value.to_le_bytes()).collect()),
         dtype: "<f8".to_owned(),
         shape: shape.to_vec(),

@@ -279,7 +279,7 @@ fn presented(headers: &HeaderMap) -> Option<Cow<'_, str>> {
         .and_then(|value| value.split_once(' '))
         .unwrap_or_default();
     let is = |known: &&str| scheme.eq_ignore_ascii_case(known);
-    if SCHEMES.iter().any(|known| is(known)) {
+    if SCHEMES.iter().any(is) {
         return Some(Cow::Borrowed(value.trim()));
     }
     if is(&BASIC) {

@@ -58,7 +58,7 @@ impl EnvironmentSocket {
                     "type is \"{}\"; it must be reset, step, state or close",
                     other.escape_default()
                 );
-                Err(refuse(SocketErrorCode::UnknownType, message))
+                Err(refuse(SocketErrorCode::UnknownType, &message))
             }
         }
     }
@@ -68,7 +68,7 @@ impl EnvironmentSocket {
         let letters = episode_id.as_ref().map_or(0, |id| id.chars().count());
         if letters > MAX_EPISODE_ID_LETTERS {
             let message = format!("episode_id has {letters} letters; the maximum is {MAX_EPISODE_ID_LETTERS}");
-            return Err(refuse(SocketErrorCode::ValidationError, message));
+            return Err(refuse(SocketErrorCode::ValidationError, &message));
         }
         let environment = self.open()?;
         let begin = move || restart(&mut lock(&environment), seed.map(Seed));
@@ -81,12 +81,12 @@ impl EnvironmentSocket {
 
     async fn step(&mut self, action: Option<Vec<f32>>) -> Result<SocketAnswer, SocketError> {
         let missing = || {
-            let message = "data.action is missing; it is the list [linear, angular]".to_owned();
+            let message = "data.action is missing; it is the list [linear, angular]";
             refuse(SocketErrorCode::ValidationError, message)
         };
         let action = action.ok_or_else(missing)?;
         let unopened = || {
-            let message = "the environment has not been reset; send reset before the first step".to_owned();
+            let message = "the environment has not been reset; send reset before the first step";
             refuse(SocketErrorCode::ExecutionError, message)
         };
         let id = self.id.as_deref().ok_or_else(unopened)?;
@@ -137,10 +137,7 @@ impl Responder for EnvironmentSocket {
     }
 
     fn refusal(&self, detail: &str) -> Message {
-        written(&SocketAnswer::Error(refuse(
-            SocketErrorCode::InvalidJson,
-            detail.to_owned(),
-        )))
+        written(&SocketAnswer::Error(refuse(SocketErrorCode::InvalidJson, detail)))
     }
 }
 
@@ -151,7 +148,7 @@ fn read(text: &str) -> Result<SocketMessage, SocketError> {
             Category::Data => SocketErrorCode::ValidationError,
             Category::Io | Category::Syntax | Category::Eof => SocketErrorCode::InvalidJson,
         };
-        refuse(code, words)
+        refuse(code, &words)
     };
     let mut json = serde_json::Deserializer::from_str(text);
     let message = serde_path_to_error::deserialize(&mut json);
@@ -166,7 +163,7 @@ fn written(answer: &SocketAnswer) -> Message {
     Message::Text(text.into())
 }
 
-fn refuse(code: SocketErrorCode, message: String) -> SocketError {
+fn refuse(code: SocketErrorCode, message: &str) -> SocketError {
     let message = without_middle(&message);
     SocketError { message, code }
 }
@@ -179,6 +176,6 @@ impl From<ApiError> for SocketError {
             ApiError::NotFound(_) => SocketErrorCode::SessionError,
             _ => SocketErrorCode::ExecutionError,
         };
-        refuse(code, error.into_detail())
+        refuse(code, &error.into_detail())
     }
 }
