@@ -371,6 +371,31 @@ async fn a_bad_observation_is_refused_in_words_and_changes_nothing() {
 }
 
 #[tokio::test]
+async fn every_damaged_observation_has_one_answer() {
+    let (_dir, _app, server) = served(ServerConfig::default()).await;
+    let (mut robot, _) = Robot::connect(server.address, "/", None).await.unwrap();
+    let sound = rmp_serde::to_vec_named(&Observation {
+        reset: true,
+        ..observation(0)
+    })
+    .unwrap();
+    let cut = (0..sound.len()).step_by(7).map(|length| sound[..length].to_vec());
+    let changed = (0..sound.len()).flat_map(|place| {
+        // Among them are the markers of lists, maps and bytes with a length of four bytes.
+        [0x00, 0xc1, 0xc6, 0xdd, 0xdf].map(|byte| {
+            let mut damaged = sound.clone();
+            damaged[place] = byte;
+            damaged
+        })
+    });
+    for damaged in cut.chain(changed) {
+        let answer = robot.ask(Message::binary(damaged)).await;
+        assert!(matches!(answer, Message::Binary(_) | Message::Text(_)), "{answer:?}");
+    }
+    assert_eq!(robot.infer(&observation(1)).await.model, "moving");
+}
+
+#[tokio::test]
 async fn the_limits_and_the_drain_of_streams_hold() {
     let config = ServerConfig {
         max_body_bytes: 4096,
