@@ -25,6 +25,7 @@ mod state;
 mod stream;
 mod token;
 mod uploads;
+mod world_session;
 
 pub use admin::serve_worker_health;
 pub use config::{ServerConfig, SettingError};

@@ -121,7 +121,7 @@ settings! {
     max_streams: usize = 128, 1..=MAX_COUNT;
     /// Maximum number of event streams of jobs; more are refused with 503.
     max_event_streams: usize = 128, 1..=MAX_COUNT;
-    /// Maximum number of simulated environments; see `environment_evict_ms`.
+    /// Maximum number of simulated environments, and of world models as environments; see `environment_evict_ms`.
     max_environments: usize = 16, 1..=10_000;
     /// Maximum number of sessions; more are refused with 503.
     max_sessions: usize = 1024, 1..=MAX_COUNT;

@@ -1,4 +1,4 @@
-//! The table of simulated environments: bounded in number and in idle time. Time is an argument.
+//! A table of environments, simulated ones or world models: bounded in number and in idle time. Time is an argument.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -15,22 +15,22 @@ use foreframe_sim::Environment;
 /// An environment that one request at a time can step.
 pub(super) type SharedEnvironment = Arc<Mutex<Environment>>;
 
-struct Entry {
-    environment: SharedEnvironment,
+struct Entry<T> {
+    environment: Arc<T>,
     maker: Caller,
     used: Instant,
 }
 
 /// All environments, by id.
-pub(super) struct Environments {
+pub(super) struct Environments<T> {
     limit: usize,
     idle: Duration,
     /// How long an environment must have been idle to be replaced when the table is full.
     evict_after: Duration,
-    table: Mutex<BTreeMap<String, Entry>>,
+    table: Mutex<BTreeMap<String, Entry<T>>>,
 }
 
-impl Environments {
+impl<T> Environments<T> {
     pub(super) fn new(config: &ServerConfig) -> Self {
         Self {
             limit: config.max_environments,
@@ -42,14 +42,14 @@ impl Environments {
 
     /// Adds an environment and gives its random id. If the table is full, it replaces the environment that was idle the
     /// longest, if that was long enough. Errors: `Unavailable` if there is none, `Internal`.
-    pub(super) fn add(&self, environment: Environment, maker: Caller, now: Instant) -> Result<String, ApiError> {
+    pub(super) fn add(&self, environment: T, maker: Caller, now: Instant) -> Result<String, ApiError> {
         let id = Token::random()?.id();
         let mut table = self.table(now);
         if table.len() >= self.limit {
             self.evict_idlest(&mut table, now)?;
         }
         let entry = Entry {
-            environment: Arc::new(Mutex::new(environment)),
+            environment: Arc::new(environment),
             maker,
             used: now,
         };
@@ -57,7 +57,7 @@ impl Environments {
         Ok(id)
     }
 
-    fn evict_idlest(&self, table: &mut BTreeMap<String, Entry>, now: Instant) -> Result<(), ApiError> {
+    fn evict_idlest(&self, table: &mut BTreeMap<String, Entry<T>>, now: Instant) -> Result<(), ApiError> {
         let idlest = table.iter().min_by_key(|(_, entry)| entry.used);
         let idlest = idlest.map(|(id, entry)| (id.clone(), now.saturating_duration_since(entry.used)));
         let (id, idle) = idlest.filter(|(_, idle)| *idle >= self.evict_after).ok_or_else(|| {
@@ -72,7 +72,7 @@ impl Environments {
     }
 
     /// The environment; counts as use. Errors: `NotFound`, also if it is another caller's.
-    pub(super) fn get(&self, id: &str, caller: Caller, now: Instant) -> Result<SharedEnvironment, ApiError> {
+    pub(super) fn get(&self, id: &str, caller: Caller, now: Instant) -> Result<Arc<T>, ApiError> {
         let mut table = self.table(now);
         let entry = table.get_mut(id).filter(|entry| caller.may_use(entry.maker));
         let entry = entry.ok_or_else(|| self.unknown(id))?;
@@ -96,7 +96,7 @@ impl Environments {
     }
 
     /// The table without the environments that have been idle for too long.
-    fn table(&self, now: Instant) -> MutexGuard<'_, BTreeMap<String, Entry>> {
+    fn table(&self, now: Instant) -> MutexGuard<'_, BTreeMap<String, Entry<T>>> {
         let mut table = self.table.lock().unwrap_or_else(PoisonError::into_inner);
         table.retain(|_, entry| now.saturating_duration_since(entry.used) < self.idle);
         table
@@ -108,11 +108,11 @@ mod tests {
     use super::*;
     use foreframe_sim::{Scenario, WorldConfig};
 
-    fn environment() -> Environment {
-        Environment::new(Scenario::Crowded, WorldConfig::default()).unwrap()
+    fn environment() -> Mutex<Environment> {
+        Mutex::new(Environment::new(Scenario::Crowded, WorldConfig::default()).unwrap())
     }
 
-    fn table(limit: usize) -> Environments {
+    fn table(limit: usize) -> Environments<Mutex<Environment>> {
         Environments::new(&ServerConfig {
             max_environments: limit,
             ..ServerConfig::default()

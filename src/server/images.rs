@@ -146,6 +146,23 @@ pub(in crate::server) fn decode(
     fit(field, codec::decode(&bytes).map_err(refused)?, input.resize, manifest)
 }
 
+/// The gray image in an array `[height, width]`, `[height, width, 1]` or `[height, width, 3]` (red, green, blue).
+pub(in crate::server) fn from_array(field: &str, shape: &[usize], values: Vec<u8>) -> Result<Frame, ImageError> {
+    let refused = |reason: String| ImageError::Refused(format!("{field} {reason}"));
+    let (height, width, pixels) = match shape {
+        [height, width] | [height, width, 1] => (*height, *width, values),
+        [height, width, 3] => (*height, *width, codec::gray_from_rgb(&values)),
+        _ => {
+            return Err(refused(format!(
+                "has the shape {shape:?}; it is [height, width], also with 1 or 3 channels at the end"
+            )));
+        }
+    };
+    let side = |side: usize| u32::try_from(side).unwrap_or(u32::MAX);
+    let frame = Frame::new(side(width), side(height), pixels);
+    frame.map_err(|error| refused(format!("is {error}")))
+}
+
 /// Pixels of any size as a frame of the model's size. `way`: how another size is resized; `None` refuses it.
 pub(in crate::server) fn fit(
     field: &str,

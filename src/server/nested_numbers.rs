@@ -12,6 +12,18 @@ pub(super) struct NestedNumbers {
     pub(super) values: Vec<f32>,
 }
 
+impl NestedNumbers {
+    /// The values as bytes. Errors: what is wrong, to follow a name.
+    pub(super) fn bytes(values: Vec<f32>) -> Result<Vec<u8>, String> {
+        let byte = |value: f32| {
+            let is_byte = (0.0..=255.0).contains(&value) && value.fract() == 0.0;
+            is_byte.then_some(value as u8).ok_or(value)
+        };
+        let bytes: Result<Vec<u8>, f32> = values.into_iter().map(byte).collect();
+        bytes.map_err(|value| format!("holds {value}; uint8 is a whole number from 0 to 255"))
+    }
+}
+
 impl<'de> Deserialize<'de> for NestedNumbers {
     /// Errors: not numbers in lists, or lists of different lengths at one level.
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {

@@ -7,7 +7,6 @@ mod numpy;
 mod observation;
 
 use std::sync::Arc;
-use std::time::Instant;
 
 use axum::extract::ws::Message;
 use metrics::counter;
@@ -15,9 +14,7 @@ use metrics::counter;
 use self::answer::{OpenpiAnswer, OpenpiMetadata, ResetStatus};
 use self::observation::{Endpoint, OpenpiObservation};
 use super::http::problem::ApiError;
-use super::images::ImageFormat;
 use super::msgpack::{self, MsgpackError};
-use super::stream::protocol::SessionSettings;
 use super::stream::request_socket::Responder;
 use super::stream::session::{Ownership, Session};
 use super::stream::socket::StreamServices;
@@ -26,7 +23,6 @@ use super::token::RandomError;
 use foreframe_core::error_text::without_middle;
 use foreframe_core::metric_names;
 use foreframe_core::registry::{Manifest, Model};
-use foreframe_core::serving::SessionState;
 
 /// Why an observation has no answer.
 #[derive(Debug, thiserror::Error)]
@@ -48,7 +44,7 @@ pub(super) struct OpenpiConnection {
 impl OpenpiConnection {
     /// Errors: `Internal`.
     pub(super) fn new(services: Arc<StreamServices>, model: Arc<Model>) -> Result<Self, ApiError> {
-        let ownership = begin(&services, model)?;
+        let ownership = Session::own(model, services.caller)?;
         Ok(Self { services, ownership })
     }
 
@@ -65,7 +61,7 @@ impl OpenpiConnection {
             _ => Arc::clone(self.model()),
         };
         if observation.endpoint == Endpoint::Reset {
-            self.ownership = begin(&self.services, model)?;
+            self.ownership = Session::own(model, self.services.caller)?;
             return Ok(msgpack::write(&ResetStatus::DONE));
         }
         let begins = observation.reset || !Arc::ptr_eq(&model, self.model());
@@ -75,7 +71,7 @@ impl OpenpiConnection {
         let step = self.services.blocking.run(read).await.map_err(StepError::from)??;
         // Only now: an observation that is refused leaves the context as it was.
         if begins {
-            self.ownership = begin(&self.services, model)?;
+            self.ownership = Session::own(model, self.services.caller)?;
         }
         let manifest = Arc::clone(&self.model().manifest);
         counter!(metric_names::STREAM_FRAMES, "model" => manifest.name.to_string()).increment(1);
@@ -107,22 +103,6 @@ impl Responder for OpenpiConnection {
     fn refusal(&self, detail: &str) -> Message {
         Message::Text(without_middle(&detail).into())
     }
-}
-
-/// A session that only its connection knows.
-fn begin(services: &StreamServices, model: Arc<Model>) -> Result<Ownership, RandomError> {
-    let settings = SessionSettings {
-        format: Some(ImageFormat::Raw),
-        ..SessionSettings::default()
-    };
-    let (session, _) = Session::new(
-        model,
-        SessionState::default(),
-        settings,
-        services.caller,
-        Instant::now(),
-    )?;
-    Ok(Arc::new(session).connect())
 }
 
 /// The model of a connection that names none: of the models that take actions, or else of all, the one with the highest skill

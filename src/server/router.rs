@@ -18,7 +18,7 @@ use super::http::requests;
 use super::openapi;
 use super::routes::{
     audit, datasets, environments, episodes, events, health, inference_protocol, job_events, jobs, metrics, models,
-    openpi, pages, predict, preview, rollouts, sessions, streams, uploads,
+    openenv, openpi, pages, predict, preview, rollouts, sessions, streams, uploads, world_sessions,
 };
 use super::state::App;
 
@@ -80,6 +80,8 @@ fn request_routes(config: &ServerConfig) -> OpenApiRouter<App> {
         .merge(episodes::routes())
         .merge(environments::routes())
         .merge(uploads::routes())
+        .merge(world_sessions::routes())
+        .merge(openenv::routes())
         .merge(audit::routes())
         .merge(inference_protocol::routes())
 }
@@ -89,6 +91,7 @@ fn stream_routes() -> OpenApiRouter<App> {
     OpenApiRouter::new()
         .merge(streams::routes())
         .merge(openpi::routes())
+        .merge(openenv::stream_routes())
         .merge(job_events::routes())
         .merge(events::routes())
 }

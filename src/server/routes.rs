@@ -11,6 +11,7 @@ pub(super) mod job_events;
 pub(super) mod jobs;
 pub(super) mod metrics;
 pub(super) mod models;
+pub(super) mod openenv;
 pub(super) mod openpi;
 pub(super) mod pages;
 pub(super) mod predict;
@@ -19,6 +20,7 @@ pub(super) mod rollouts;
 pub(super) mod sessions;
 pub(super) mod streams;
 pub(super) mod uploads;
+pub(super) mod world_sessions;
 
 mod bounds;
 mod picture;

@@ -4,8 +4,8 @@ use std::collections::BTreeSet;
 use std::convert::Infallible;
 use std::error::Error;
 use std::ops::Deref;
-use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use axum::Extension;
@@ -26,12 +26,14 @@ use super::inference_statistics::InferenceStatistics;
 use super::render_cache::RenderCache;
 use super::stream::session_table::SessionTable;
 use super::uploads::Uploads;
+use super::world_session::SharedWorldSession;
 use foreframe_core::registry::Model;
 use foreframe_core::serving::Predictor;
 use foreframe_jobs::jobs::pipeline::Pipeline;
 use foreframe_jobs::jobs::{JobError, Jobs, child};
 use foreframe_jobs::store::{Author, Store};
 use foreframe_jobs::versions::Versions;
+use foreframe_sim::Environment;
 
 /// How often the server checks which versions other servers of the same store activated.
 const FOLLOW_EVERY: Duration = Duration::from_secs(1);
@@ -74,7 +76,8 @@ pub struct AppState {
     pub(super) render_cache: RenderCache,
     /// The threads for simulations and for what is neither a prediction nor a picture.
     pub(super) blocking: BlockingWork,
-    pub(super) environments: Environments,
+    pub(super) environments: Environments<Mutex<Environment>>,
+    pub(super) world_sessions: Environments<SharedWorldSession>,
     pub(super) uploads: Uploads,
     /// Whether the server is stopping: it still answers, but reports that it is not ready.
     pub(super) draining: Arc<AtomicBool>,
@@ -136,6 +139,7 @@ impl App {
                 blocking: BlockingWork::new("requests", config.request_threads, false),
                 environments: Environments::new(&config),
                 uploads: Uploads::new(&config),
+                world_sessions: Environments::new(&config),
                 draining: Arc::default(),
                 sessions: SessionTable::new(config.max_sessions, Duration::from_millis(config.session_grace_ms)),
                 inference_statistics: InferenceStatistics::default(),

@@ -191,6 +191,9 @@ def bodies():
         "422-environments-unknown-camera": environment | {"world": small | {"camera": {"zoom": 3}}},
         "422-step-action-of-three": {"action": [1, 2, 3]},
         "422-step-action-too-great": {"action": [3e38, 0]},
+        "200-openenv-sound": {"action": {"action": [0.3, -0.2], "metadata": {}}, "timeout_s": 1},
+        "422-openenv-no-action": {"action": {}},
+        "422-openenv-action-of-three": {"action": {"action": [1, 2, 3]}},
     }.items():
         write("bodies", f"{name}.json", json.dumps(body))
     text = json.dumps(predict)

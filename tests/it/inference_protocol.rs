@@ -99,7 +99,7 @@ async fn requests_that_cannot_be_used_are_refused_with_their_tensor() {
     for (frames, words) in [
         (json!({"data": [1, 2]}), "input \"frames\" holds 2 values"),
         (json!({"data": ["a"]}), "numbers in lists"),
-        (json!({"data": [[[300]]], "shape": [1, 1, 1]}), "holds 300; UINT8"),
+        (json!({"data": [[[300]]], "shape": [1, 1, 1]}), "holds 300; uint8"),
         (json!({"parameters": {"binary_data_size": 9}}), "has 9 bytes; 0 follow"),
         (json!({"parameters": {"shared_memory_region": "a"}}), "shared memory"),
         (json!({"datatype": "BYTES", "data": []}), "is BYTES"),

@@ -63,6 +63,7 @@ mod nn_optimizer;
 mod nn_reference;
 mod nn_spec;
 #[cfg(feature = "otlp")]
+mod openenv;
 mod openpi;
 mod otlp;
 mod overload;
@@ -103,3 +104,4 @@ mod tls;
 mod training;
 mod uploads;
 mod warp;
+mod world_sessions;

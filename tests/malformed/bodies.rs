@@ -21,10 +21,14 @@ static ENVIRONMENT: LazyLock<String> = LazyLock::new(|| {
     answer.json()["id"].as_str().unwrap().to_owned()
 });
 
+/// A step of a world model; the body is read before its session is looked up.
+const WORLD_STEP: &str = "/v1/realtime/sessions/none/step";
+
 fn path(endpoint: &str) -> String {
     match endpoint {
         "predict" | "rollouts" => format!("/v1/models/moving/{endpoint}"),
         "step" => format!("/v1/environments/{}/step", *ENVIRONMENT),
+        "openenv" => "/openenv/static-observer/step".to_owned(),
         other => format!("/v1/{other}"),
     }
 }
@@ -143,6 +147,10 @@ fn request_memory_is_bounded_by_the_body_length() {
         ("/v1/jobs", filled(r#"{"settings":{"a":["#, "{},", 60 << 10)),
         ("/v1/jobs", filled(r#"{"colour":["#, "0,", long)),
         ("/v1/environments", filled(r#"{"scenario":["#, "0,", long)),
+        (WORLD_STEP, filled(r#"{"observation":{"images":{"a":["#, "0,", long)),
+        (WORLD_STEP, filled(r#"{"observation":{"images":{"a":["#, "[],", long)),
+        (WORLD_STEP, filled(r#"{"observation":{"extra":{"colour":["#, "0,", long)),
+        ("/openenv/crowded/step", filled(r#"{"action":{"action":["#, "0,", long)),
     ] {
         let refused = SERVICE.json(&body[..40], path, body.clone().into()).status.as_u16();
         assert!([400, 413, 422].contains(&refused), "{refused}: {}", &body[..40]);

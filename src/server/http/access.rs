@@ -12,15 +12,15 @@ pub(super) fn route(request: &Request) -> &str {
 
 /// The scope that a request needs, by its method and its route's template. A route without a rule needs `admin`.
 pub(in crate::server) fn required_scope(method: &Method, route: &str) -> KeyScope {
-    // The Open Inference Protocol only predicts.
-    if route.starts_with("/v2/") {
+    // The Open Inference Protocol only predicts, OpenEnv only simulates.
+    if route.starts_with("/v2/") || route.starts_with("/openenv/") {
         return KeyScope::Predict;
     }
     let mut parts = route.split('/').skip(2);
     let (resource, changes_versions) = (parts.next().unwrap_or_default(), route.contains("/versions/"));
     match resource {
         "models" if changes_versions => KeyScope::Admin,
-        "models" | "sessions" | "environments" | "events" => KeyScope::Predict,
+        "models" | "sessions" | "realtime" | "environments" | "events" => KeyScope::Predict,
         "datasets" if *method == Method::DELETE => KeyScope::Admin,
         "datasets" | "jobs" | "uploads" => KeyScope::Jobs,
         _ => KeyScope::Admin,
@@ -59,12 +59,14 @@ mod tests {
             (Method::POST, "/v1/models/{model}/predict", KeyScope::Predict),
             (Method::DELETE, "/v1/models/{model}/versions/{version}", KeyScope::Admin),
             (Method::GET, "/v1/events", KeyScope::Predict),
+            (Method::POST, "/v1/realtime/sessions/{id}/step", KeyScope::Predict),
             (Method::GET, "/v1/datasets", KeyScope::Jobs),
             (Method::DELETE, "/v1/datasets/{dataset}", KeyScope::Admin),
             (Method::POST, "/v1/jobs", KeyScope::Jobs),
             (Method::POST, "/v1/uploads", KeyScope::Jobs),
             (Method::GET, "/v1/audit", KeyScope::Admin),
             (Method::GET, "/v1/new", KeyScope::Admin),
+            (Method::GET, "/openenv/{scenario}/ws", KeyScope::Predict),
             (
                 Method::POST,
                 "/v2/models/{model}/versions/{version}/infer",

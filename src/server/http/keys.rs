@@ -1,5 +1,6 @@
 //! API keys: how they are made, and which requests they allow.
 
+use std::borrow::Cow;
 use std::collections::HashMap;
 use std::convert::Infallible;
 use std::sync::Arc;
@@ -10,7 +11,7 @@ use axum::http::{HeaderMap, header};
 use axum::middleware::Next;
 use axum::response::Response;
 use base64::Engine as _;
-use base64::engine::general_purpose::URL_SAFE_NO_PAD;
+use base64::engine::general_purpose::{STANDARD, URL_SAFE_NO_PAD};
 use metrics::counter;
 use tokio::sync::watch;
 use tracing::warn;
@@ -28,6 +29,8 @@ const PREFIX: &str = "ffk";
 const SUBPROTOCOL_PREFIX: &str = "foreframe.key.";
 /// `Api-Key` is what openpi's clients send.
 const SCHEMES: [&str; 2] = ["bearer", "api-key"];
+/// The scheme of an address with a password, which is the key: for clients that cannot set headers.
+const BASIC: &str = "basic";
 const ID_BYTES: usize = 6;
 const SECRET_BYTES: usize = 32;
 
@@ -228,7 +231,7 @@ impl Keys {
 
     /// As [`Keys::check`], with the key that a request presents; counts refusals.
     pub(in crate::server) fn admit(&self, headers: &HeaderMap, needed: KeyScope) -> Result<(Caller, Author), ApiError> {
-        let checked = self.check(presented(headers), needed);
+        let checked = self.check(presented(headers).as_deref(), needed);
         checked.inspect_err(|_| counter!(metric_names::AUTH_REFUSED).increment(1))
     }
 
@@ -270,16 +273,26 @@ pub(in crate::server) async fn check(
 }
 
 /// The key that a request presents.
-fn presented(headers: &HeaderMap) -> Option<&str> {
-    let bearer = headers.get(header::AUTHORIZATION).and_then(|value| value.to_str().ok());
-    let bearer = bearer.and_then(|value| value.split_once(' '));
-    let bearer = bearer.filter(|(scheme, _)| SCHEMES.iter().any(|known| scheme.eq_ignore_ascii_case(known)));
+fn presented(headers: &HeaderMap) -> Option<Cow<'_, str>> {
+    let authorization = headers.get(header::AUTHORIZATION).and_then(|value| value.to_str().ok());
+    let (scheme, value) = authorization
+        .and_then(|value| value.split_once(' '))
+        .unwrap_or_default();
+    let is = |known: &&str| scheme.eq_ignore_ascii_case(known);
+    if SCHEMES.iter().any(is) {
+        return Some(Cow::Borrowed(value.trim()));
+    }
+    if is(&BASIC) {
+        let credentials = String::from_utf8(STANDARD.decode(value.trim()).ok()?).ok()?;
+        let (_, password) = credentials.split_once(':')?;
+        return Some(Cow::Owned(password.to_owned()));
+    }
     let protocols = headers.get(header::SEC_WEBSOCKET_PROTOCOL);
     let protocols = protocols.and_then(|value| value.to_str().ok()).unwrap_or("");
     let mut offered = protocols.split(',').map(str::trim);
-    bearer
-        .map(|(_, key)| key.trim())
-        .or_else(|| offered.find_map(|protocol| protocol.strip_prefix(SUBPROTOCOL_PREFIX)))
+    offered
+        .find_map(|protocol| protocol.strip_prefix(SUBPROTOCOL_PREFIX))
+        .map(Cow::Borrowed)
 }
 
 #[cfg(test)]
@@ -304,11 +317,18 @@ mod tests {
     #[test]
     fn a_key_is_found_in_either_header() {
         let with = |name, value| HeaderMap::from_iter([(name, HeaderValue::from_static(value))]);
-        assert_eq!(presented(&with(header::AUTHORIZATION, "bearer abc")), Some("abc"));
-        assert_eq!(presented(&with(header::AUTHORIZATION, "Api-Key abc")), Some("abc"));
+        for authorization in ["bearer abc", "Api-Key abc", "Basic cm9ib3Q6YWJj"] {
+            assert_eq!(
+                presented(&with(header::AUTHORIZATION, authorization)).as_deref(),
+                Some("abc")
+            );
+        }
         assert_eq!(presented(&with(header::AUTHORIZATION, "Basic abc")), None);
         let offered = "foreframe.v1.json, foreframe.key.abc";
-        assert_eq!(presented(&with(header::SEC_WEBSOCKET_PROTOCOL, offered)), Some("abc"));
+        assert_eq!(
+            presented(&with(header::SEC_WEBSOCKET_PROTOCOL, offered)).as_deref(),
+            Some("abc")
+        );
         assert_eq!(presented(&HeaderMap::new()), None);
     }
 }

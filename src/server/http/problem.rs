@@ -110,6 +110,11 @@ impl ApiError {
         }
     }
 
+    /// What was wrong, for protocols whose errors are not problem details.
+    pub(in crate::server) fn into_detail(self) -> String {
+        self.into_parts().2
+    }
+
     /// The status, the end of the problem's URN, and what was wrong.
     fn into_parts(self) -> (StatusCode, &'static str, String) {
         match self {

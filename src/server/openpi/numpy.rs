@@ -61,14 +61,7 @@ impl ReceivedArray {
             ReceivedValues::Numpy { dtype, .. } => {
                 Err(format!("has the dtype {}; it must be uint8", dtype.escape_default()))
             }
-            ReceivedValues::Numbers(values) => {
-                let byte = |value: f32| {
-                    let is_byte = (0.0..=255.0).contains(&value) && value.fract() == 0.0;
-                    is_byte.then_some(value as u8).ok_or(value)
-                };
-                let bytes: Result<Vec<u8>, f32> = values.into_iter().map(byte).collect();
-                bytes.map_err(|value| format!("holds {value}; uint8 is a whole number from 0 to 255"))
-            }
+            ReceivedValues::Numbers(values) => NestedNumbers::bytes(values),
         }
     }
 }

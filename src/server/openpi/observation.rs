@@ -6,7 +6,6 @@ use super::numpy::ReceivedArray;
 use crate::server::images::{self, ImageFormat};
 use crate::server::stream::step::{FrameStep, StepConditions, StepError};
 use foreframe_core::frame::Frame;
-use foreframe_core::frame::codec::gray_from_rgb;
 use foreframe_core::frame::resize::Resize;
 use foreframe_core::registry::Manifest;
 use foreframe_core::serving::OBSERVATION_FIELDS;
@@ -78,20 +77,8 @@ fn wrong(key: &str, reason: &str) -> StepError {
 /// A gray image.
 fn image(array: ReceivedArray) -> Result<Frame, StepError> {
     let shape = array.shape.clone();
-    let (height, width, is_color) = match shape.as_slice() {
-        [height, width] | [height, width, 1] => (*height, *width, false),
-        [height, width, 3] => (*height, *width, true),
-        _ => {
-            let reason =
-                format!("has the shape {shape:?}; it is [height, width], also with 1 or 3 channels at the end");
-            return Err(wrong("frame", &reason));
-        }
-    };
-    let pixels = array.bytes().map_err(|reason| wrong("frame", &reason))?;
-    let pixels = if is_color { gray_from_rgb(&pixels) } else { pixels };
-    let side = |side: usize| u32::try_from(side).unwrap_or(u32::MAX);
-    let frame = Frame::new(side(width), side(height), pixels);
-    frame.map_err(|error| wrong("frame", &format!("is {error}")))
+    let values = array.bytes().map_err(|reason| wrong("frame", &reason))?;
+    Ok(images::from_array("frame", &shape, values)?)
 }
 
 /// The numbers of one row.

@@ -1,6 +1,6 @@
 //! The simulator over HTTP, with reset and step as in Gymnasium; for training policies and for the page at `/`.
 
-use std::sync::{MutexGuard, PoisonError};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Instant;
 
 use axum::http::{StatusCode, header};
@@ -65,7 +65,7 @@ struct StepRequest {
 
 /// An observation.
 #[derive(Debug, Serialize, utoipa::ToSchema)]
-struct ObservationBody {
+pub(super) struct ObservationBody {
     /// The camera's frame: PNG, base64.
     frame: ImageBytes,
     /// In the order and units of the environment's `state`.
@@ -74,7 +74,7 @@ struct ObservationBody {
 
 /// Information beside the observation.
 #[derive(Debug, Serialize, utoipa::ToSchema)]
-struct Info {
+pub(super) struct Info {
     /// Time since the start of the episode, in seconds.
     time_s: f64,
     /// The next action of the simulator's own driver.
@@ -109,26 +109,26 @@ struct EnvironmentBody {
 
 /// The start of an episode.
 #[derive(Debug, Serialize, utoipa::ToSchema)]
-struct ResetBody {
+pub(super) struct ResetBody {
     /// The observation.
-    observation: ObservationBody,
+    pub(super) observation: ObservationBody,
     /// Information beside the observation.
-    info: Info,
+    pub(super) info: Info,
 }
 
 /// The result of a step.
 #[derive(Debug, Serialize, utoipa::ToSchema)]
-struct StepBody {
+pub(super) struct StepBody {
     /// The observation after the step.
-    observation: ObservationBody,
+    pub(super) observation: ObservationBody,
     /// 1 if the other robot is in the middle of the view, 0 if it is out of view; minus 1 for a collision.
-    reward: f32,
+    pub(super) reward: f32,
     /// The other robot has reached its goal.
-    terminated: bool,
+    pub(super) terminated: bool,
     /// The time of the episode is over.
-    truncated: bool,
+    pub(super) truncated: bool,
     /// Information beside the observation.
-    info: Info,
+    pub(super) info: Info,
 }
 
 /// Creates a simulated robot that you can drive. If all environments are in use, it replaces the one that was idle the
@@ -143,7 +143,7 @@ struct StepBody {
 )]
 async fn create(app: App, caller: Caller, Json(request): Json<NewEnvironment>) -> Result<impl IntoResponse, ApiError> {
     let (environment, body) = app.blocking.run(move || begin(&request)).await??;
-    let id = app.environments.add(environment, caller, Instant::now())?;
+    let id = app.environments.add(Mutex::new(environment), caller, Instant::now())?;
     let location = format!("/v1/environments/{id}");
     let created = axum::Json(EnvironmentBody { id, ..body });
     Ok((StatusCode::CREATED, [(header::LOCATION, location)], created))
@@ -217,7 +217,7 @@ fn begin(request: &NewEnvironment) -> Result<(Environment, EnvironmentBody), Api
     Ok((environment, body))
 }
 
-fn restart(environment: &mut Environment, seed: Option<Seed>) -> Result<ResetBody, ApiError> {
+pub(super) fn restart(environment: &mut Environment, seed: Option<Seed>) -> Result<ResetBody, ApiError> {
     let (observation, trial) = environment.reset(seed).map_err(unfit("world"))?;
     Ok(ResetBody {
         info: info(environment.world(), &observation, Some(trial)),
@@ -225,7 +225,7 @@ fn restart(environment: &mut Environment, seed: Option<Seed>) -> Result<ResetBod
     })
 }
 
-fn advance(environment: &mut Environment, action: Vec<f32>) -> Result<StepBody, ApiError> {
+pub(super) fn advance(environment: &mut Environment, action: Vec<f32>) -> Result<StepBody, ApiError> {
     let action = Action::try_from(action).map_err(unfit("action"))?;
     let StepResult {
         observation,
@@ -269,6 +269,6 @@ fn poses(world: &World) -> Vec<PlanarPose> {
         .collect()
 }
 
-fn lock(environment: &SharedEnvironment) -> MutexGuard<'_, Environment> {
+pub(super) fn lock(environment: &SharedEnvironment) -> MutexGuard<'_, Environment> {
     environment.lock().unwrap_or_else(PoisonError::into_inner)
 }

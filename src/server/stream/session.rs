@@ -71,6 +71,16 @@ impl Session {
         Ok((session, token.text()))
     }
 
+    /// A session that only its holder knows, for other protocols; its answers hold raw pixels. Errors: as [`Session::new`].
+    pub(in crate::server) fn own(model: Arc<Model>, maker: Caller) -> Result<Ownership, RandomError> {
+        let settings = SessionSettings {
+            format: Some(ImageFormat::Raw),
+            ..SessionSettings::default()
+        };
+        let (session, _) = Self::new(model, SessionState::default(), settings, maker, Instant::now())?;
+        Ok(Arc::new(session).connect())
+    }
+
     pub(in crate::server) fn state(&self) -> (SessionState, SessionSettings) {
         let inner = self.inner();
         (inner.core.state.clone(), inner.core.settings)

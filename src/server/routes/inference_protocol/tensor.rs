@@ -187,14 +187,7 @@ fn from_numbers(datatype: Datatype, numbers: Vec<f32>) -> Result<Values, String>
     if datatype == Datatype::Fp32 {
         return Ok(Values::Fp32(numbers));
     }
-    let byte = |value: f32| {
-        let is_byte = (0.0..=255.0).contains(&value) && value.fract() == 0.0;
-        is_byte.then_some(value as u8).ok_or(value)
-    };
-    let bytes: Result<Vec<u8>, f32> = numbers.into_iter().map(byte).collect();
-    bytes
-        .map(Values::Uint8)
-        .map_err(|value| format!("holds {value}; UINT8 is a whole number from 0 to 255"))
+    NestedNumbers::bytes(numbers).map(Values::Uint8)
 }
 
 fn from_bytes(datatype: Datatype, bytes: &[u8]) -> Values {
