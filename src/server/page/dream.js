@@ -49,7 +49,7 @@ class Dreaming {
   // The model's answer to its context: the first imagined frame is that of the moment that comes now.
   async fallAsleep() {
     const { context, model } = this.robot;
-    this.stream = await Stream.open(model.name);
+    this.stream = await Stream.open(model.name, context.at(-1).camera);
     const answer = await sendAll(this.stream, context);
     const last = context.at(-1);
     [this.frame, this.novelty, this.state] = [answer.frames[0], answer.novelty, this.nextState(last.state, last.action)];
