@@ -6,6 +6,7 @@
 
 mod admin_address;
 mod backup;
+mod bridge;
 mod calibrate;
 mod collect;
 mod config;
@@ -66,6 +67,7 @@ enum Command {
     Evaluate(evaluate::EvaluateArgs),
     Calibrate(calibrate::CalibrateArgs),
     Predict(predict::PredictArgs),
+    Bridge(bridge::BridgeArgs),
     Serve(serve::ServeArgs),
     Publish(publish::PublishArgs),
     Models(models::ModelsArgs),
@@ -104,6 +106,7 @@ fn run(command: Option<Command>) -> Result<(), CliError> {
         Command::Evaluate(args) => evaluate::run(&args),
         Command::Calibrate(args) => calibrate::run(&args),
         Command::Predict(args) => predict::run(&args),
+        Command::Bridge(args) => bridge::run(args),
         Command::Serve(args) => serve::run(&args),
         Command::Publish(args) => publish::run(&args),
         Command::Models(args) => models::run(&args),

@@ -138,5 +138,8 @@ pub mod server;
 pub mod config;
 
 #[cfg(feature = "server")]
+mod bridge;
+
+#[cfg(feature = "server")]
 #[doc(hidden)]
 pub mod cli;

@@ -8,6 +8,7 @@ mod audit;
 mod backup;
 mod bag_files;
 mod bags;
+mod bridge;
 mod browser;
 mod calibration;
 mod cli;

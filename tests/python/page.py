@@ -150,6 +150,28 @@ def keys_and_touch_drive(browser, server):
     page.context.close()
 
 
+def a_model_of_rooms_is_driven_in_varied_rooms(browser, server):
+    page = browser.open("play?model=rooms")
+    posted = []
+    page.on("request", lambda request: posted.append(request.post_data) if request.method == "POST" else None)
+    page.reload()
+    wait_for_verdict(page)
+    assert page.get_by_label("Source").locator("option").all_inner_texts()[:2] == ["simulator, varied rooms", "simulator, one room"]
+    assert any('"rooms":"varied"' in body for body in posted if body), "the environment is in a room of its own"
+    assert any('"camera":{"height_m"' in body and '"states"' in body for body in posted if body), "its camera and all states are sent"
+    wait_for_pictures(page, 7)
+    errors = []
+    page.on("response", lambda response: errors.append(response.url) if response.status >= 400 else None)
+    page.goto(f"{server.address}/#what-if?model=rooms")
+    wait_until(lambda: page.locator(".plan.best").count() == 1, "a best plan in a varied room", 120)
+    page.goto(f"{server.address}/#dream?model=rooms")
+    expect(page.get_by_role("button", name="Cut the camera")).to_be_enabled(timeout=60_000)
+    page.keyboard.press("Space")
+    wait_until(lambda: float(page.locator(".imagined").inner_text().split()[0]) >= 0.4, "a dream in a varied room")
+    assert not errors, errors
+    page.context.close()
+
+
 def survives_restarts(browser, server):
     page = browser.open("play")
     wait_for_verdict(page)
@@ -334,7 +356,7 @@ def main():
     collect = {"kind": "collect", "name": "room", "scenario": "moving-observer", "trials": 40, "seed": 11}
     job = server.post("/v1/jobs", collect)["id"]
     wait_until(lambda: (server.get(f"/v1/jobs/{job}") or {}).get("state") == "succeeded", "a data set", 240)
-    tests = [opens_on_the_best_drivable_model, keys_and_touch_drive, survives_restarts, a_dream_goes_on_and_is_saved, a_plan_is_chosen_and_taken]
+    tests = [opens_on_the_best_drivable_model, a_model_of_rooms_is_driven_in_varied_rooms, keys_and_touch_drive, survives_restarts, a_dream_goes_on_and_is_saved, a_plan_is_chosen_and_taken]
     tests += [an_episode_is_played, a_dropped_file_is_imported, it_is_small, it_rests_when_hidden, a_training_is_watched]
     only = os.environ.get("PAGE_TEST")
     try:

@@ -2,6 +2,8 @@
 
 pub mod motion;
 
+pub mod protobuf;
+
 pub mod dataset;
 
 pub mod inspection;

@@ -74,12 +74,13 @@ function Follow({ id }) {
 function Collect({ submit }) {
   const onSubmit = event => {
     event.preventDefault();
-    const { name, scenario, trials, seed } = filled(event.target);
-    submit({ kind: "collect", name, scenario, trials: +trials, seed: +seed });
+    const { name, scenario, rooms, trials, seed } = filled(event.target);
+    submit({ kind: "collect", name, scenario, ...(rooms && { rooms }), trials: +trials, seed: +seed });
   };
   return html`<form class="card" onSubmit=${onSubmit}><h3>Collect from the simulator</h3><div class="form">
     <label>Name <input name="name" required pattern="[a-z0-9][a-z0-9\\-]*" placeholder="first" /></label>
     <label>Scenario <select name="scenario">${SCENARIOS.map(one => html`<option value=${one}>${one}</option>`)}</select></label>
+    <label>Rooms <select name="rooms"><option value="">one</option><option value="varied">varied, one a trial</option></select></label>
     <label>Trials <input name="trials" type="number" min="1" max="1000000" value="50" /></label>
     <label>Seed <input name="seed" type="number" min="0" value="1" /></label>
     </div><div class="actions"><button class="main">Collect</button></div></form>`;

@@ -9,6 +9,7 @@ import { useMoments } from "./robot.js";
 import { AVERAGED, levels, NOVEL, novelty, noveltyClass, noveltyWord, share } from "./score.js";
 import { takesActions } from "./server_lists.js";
 import { Copy, curl, requests, streamInPython } from "./snippets.js";
+import { VARIED } from "./sources.js";
 
 const SPEEDS = [1, 2, 6];
 
@@ -62,7 +63,7 @@ export function Play({ robot }) {
 
 // A stream from the simulator; for a recording, one prediction of its present frames.
 function program({ model, source_id, context }) {
-  if (source_id === "simulator") return streamInPython(model.name, model.lineage.scenario);
+  if (!source_id.startsWith("set:")) return streamInPython(model.name, model.lineage.scenario, source_id === VARIED);
   const actions = takesActions(model) ? { actions: context.map(({ action }) => action) } : {};
   return requests("POST", `/v1/models/${model.name}/predict`, { ...contextBody(model, context), ...actions });
 }
@@ -117,7 +118,7 @@ function Driving({ robot }) {
   const moves = takesActions(robot.model) && now?.action?.length
     ? robot.spec.actions.map(({ name, unit }, place) => `${name} ${now.action[place].toFixed(2)} ${unit}`).join(", ") : "";
   if (!robot.is_drivable) {
-    return html`<div><h2>Source</h2><p class="driver">${robot.source_id === "simulator" ? "A standing camera: there is nothing to drive." : "A recorded episode: its actions are recorded too."}</p>
+    return html`<div><h2>Source</h2><p class="driver">${!robot.source_id.startsWith("set:") ? "A standing camera: there is nothing to drive." : "A recorded episode: its actions are recorded too."}</p>
       <p class="quiet">${moves}</p></div>`;
   }
   const by = isManual() ? `You drive; automatic again in ${drivesAgainIn_s()} s` : "It drives itself until you touch a key";

@@ -114,7 +114,7 @@ export class Robot {
   // A new stream, with the context so far.
   async openStream() {
     this.stream?.close();
-    this.stream = await Stream.open(this.model.name);
+    this.stream = await Stream.open(this.model.name, this.now.camera);
     if (!this.now.begins) await sendAll(this.stream, this.context.slice(1 - this.spec.context));
   }
 

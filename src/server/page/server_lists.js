@@ -28,6 +28,9 @@ export const skillOf = model => model.metrics.test?.skill;
 export const takesActions = model => model.spec.conditioning.endsWith("action");
 export const takesState = model => model.spec.conditioning.startsWith("state");
 
+// Such a model takes the state at every frame, and frames of any camera.
+export const estimatesDepth = model => Boolean(model.spec.flow?.depth);
+
 export async function readModels() {
   const { models, notice } = await all("/v1/models", "models");
   change({ models: models.sort(bySkill), notice: notice ?? null });

@@ -21,15 +21,21 @@ export function requests(method, path, body, rest = "print(answer.json())") {
 }
 
 // A stream needs a program: this one drives the simulator and predicts from its frames.
-export function streamInPython(model, scenario) {
+export function streamInPython(model, scenario, is_varied) {
   const headers = hasKey() ? ', additional_headers={"Authorization": "Bearer KEY"}' : "";
   const given = hasKey() ? ', headers={"Authorization": "Bearer KEY"}' : "";
+  const world = is_varied ? ', "world": {"rooms": "varied"}' : "";
+  // Each of these rooms has a camera of its own, which only a session can be told.
+  const address = is_varied ? `camera = robot["info"]["trial"]["room"]["camera"]
+del camera["noise_std"]
+session = requests.post(f"{server}/v1/sessions", json={"model": "${model}", "camera": camera}${given}).json()
+address = server.replace("http", "ws", 1) + f"/v1/sessions/{session['id']}/stream?token={session['token']}"` : `address = server.replace("http", "ws", 1) + "/v1/models/${model}/stream"`;
   return `import json, requests
 from websockets.sync.client import connect
 
 server = "${location.origin}"
-robot = requests.post(f"{server}/v1/environments", json={"scenario": "${scenario}"}${given}).json()
-address = server.replace("http", "ws", 1) + "/v1/models/${model}/stream"
+robot = requests.post(f"{server}/v1/environments", json={"scenario": "${scenario}"${world}}${given}).json()
+${address}
 with connect(address, subprotocols=["foreframe.v1.json"]${headers}) as stream:
     print(json.loads(stream.recv())["type"])  # ready
     for seq in range(20):

@@ -2,12 +2,15 @@
 
 import { call, deleteAtEnd, get } from "./api.js";
 import { fromPng } from "./gray.js";
-import { takesActions, takesState } from "./server_lists.js";
+import { estimatesDepth, takesActions, takesState } from "./server_lists.js";
 
 const SIMULATOR_ACTIONS = ["linear", "angular"];
 export const SIMULATOR_STATES = ["x", "y", "heading_cos", "heading_sin", "linear", "angular"];
 // The camera of the simulated robot, unless the model names another one.
 const DEFAULT_CAMERA = { height_m: 0.6, horizontal_fov_rad: Math.PI / 3, tilt_down_rad: 0.2, noise_std: 1 / 255 };
+
+// Each episode in a room of its own.
+export const VARIED = "simulator:varied";
 
 const names = channels => channels.map(({ name }) => name);
 const areEqual = (one, other) => one.length === other.length && one.every((name, index) => name === other[index]);
@@ -31,41 +34,44 @@ export function fits(model, dataset) {
 
 // The sources that a model can be offered: { id, label }.
 export function sourcesOf(model, datasets) {
-  const simulator = fitsSimulator(model) ? [{ id: "simulator", label: "simulator" }] : [];
+  const varied = estimatesDepth(model) ? [{ id: VARIED, label: "simulator, varied rooms" }] : [];
+  const simulator = fitsSimulator(model) ? [...varied, { id: "simulator", label: varied.length ? "simulator, one room" : "simulator" }] : [];
   const fitting = (datasets ?? []).filter(dataset => fits(model, dataset));
   return [...simulator, ...fitting.map(({ name }) => ({ id: `set:${name}`, label: `recorded: ${name}` }))];
 }
 
 export function openSource(model, id, episode) {
-  return id.startsWith("set:") ? Recording.open(id.slice(4), episode) : Simulator.open(model);
+  return id.startsWith("set:") ? Recording.open(id.slice(4), episode) : Simulator.open(model, id === VARIED);
 }
 
 // A simulated robot on the server. A moment is what is known at a frame: the frame, the state, the driver's next action, the true
-// poses, and whether an episode begins.
+// poses, whether an episode begins, and the camera where each episode has its own.
 class Simulator {
-  static async open(model) {
+  static async open(model, is_varied) {
     const { frame_period_s, frame_width_px, frame_height_px, camera } = model.spec;
     const scenario = model.lineage.scenario;
     const stands = scenario === "static-observer";
     const world = { frame_period_s, frame_width_px, frame_height_px, max_duration_s: stands ? 30 : 3600 };
-    if (camera) world.camera = { ...DEFAULT_CAMERA, horizontal_fov_rad: camera.horizontal_fov_rad, tilt_down_rad: camera.tilt_down_rad };
+    if (is_varied) world.rooms = "varied";
+    else if (camera) world.camera = { ...DEFAULT_CAMERA, horizontal_fov_rad: camera.horizontal_fov_rad, tilt_down_rad: camera.tilt_down_rad };
     const seed = Math.floor(Math.random() * 2 ** 32);
     const made = await call("POST", "/v1/environments", { scenario, seed, world });
-    return new Simulator(made, !stands, await moment(made, true));
+    return new Simulator(made, !stands, await moment(made, null));
   }
 
   constructor({ id }, is_drivable, first) {
     this.path = `/v1/environments/${id}`;
     this.is_drivable = is_drivable;
-    this.first = first;
+    this.first = this.latest = first;
     this.leave = () => deleteAtEnd(this.path);
     addEventListener("pagehide", this.leave);
   }
 
   async step(action) {
     const step = await call("POST", `${this.path}/step`, { action });
-    if (!step.terminated && !step.truncated) return moment(step, false);
-    return moment(await call("POST", `${this.path}/reset`, {}), true);
+    const is_over = step.terminated || step.truncated;
+    this.latest = await moment(is_over ? await call("POST", `${this.path}/reset`, {}) : step, is_over ? null : this.latest);
+    return this.latest;
   }
 
   close() {
@@ -74,9 +80,18 @@ class Simulator {
   }
 }
 
-async function moment({ observation, info }, begins) {
+// `before` is null where an episode begins.
+async function moment({ observation, info }, before) {
   const frame = await fromPng(observation.frame);
-  return { frame, state: observation.state, driver: info.policy_action, poses: info.poses, begins };
+  const camera = before ? before.camera : cameraOf(info.trial?.room);
+  return { frame, state: observation.state, driver: info.policy_action, poses: info.poses, begins: !before, camera };
+}
+
+// A model has no use for the noise of the room's camera.
+function cameraOf(room) {
+  if (!room) return undefined;
+  const { height_m, horizontal_fov_rad, tilt_down_rad } = room.camera;
+  return { height_m, horizontal_fov_rad, tilt_down_rad };
 }
 
 const EPISODE_FRAMES = 300;

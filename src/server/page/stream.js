@@ -1,16 +1,21 @@
 // A stream of a model over a WebSocket: frames go in, predicted frames come out. See /asyncapi.yaml.
 
-import { keyProtocols } from "./api.js";
+import { call, deleteAtEnd, keyProtocols } from "./api.js";
 import { toBytes } from "./base64.js";
 import { Gray, raw } from "./gray.js";
 
 export class Stream {
-  // Resolves when the server is ready for the first frame.
-  static open(model) {
+  // Resolves when the server is ready for the first frame. Another camera than the model's needs a session.
+  static async open(model, camera) {
+    if (!camera) return Stream.connect(`/v1/models/${model}/stream`);
+    const { id, token } = await call("POST", "/v1/sessions", { model, camera });
+    return Object.assign(await Stream.connect(`/v1/sessions/${id}/stream?token=${token}`), { session: `/v1/sessions/${id}?token=${token}` });
+  }
+
+  static connect(path) {
     return new Promise((opened, failed) => {
       const scheme = location.protocol === "https:" ? "wss" : "ws";
-      const address = `${scheme}://${location.host}/v1/models/${model}/stream`;
-      const stream = new Stream(new WebSocket(address, ["foreframe.v1.json", ...keyProtocols()]));
+      const stream = new Stream(new WebSocket(`${scheme}://${location.host}${path}`, ["foreframe.v1.json", ...keyProtocols()]));
       stream.waiting.set("ready", { resolve: ready => opened(Object.assign(stream, { ready })), reject: failed });
     });
   }
@@ -59,6 +64,7 @@ export class Stream {
   close() {
     this.socket.onclose = null;
     this.fail("closed");
+    if (this.session) deleteAtEnd(this.session);
   }
 }
 

@@ -41,8 +41,8 @@ function usePresets() {
   return presets;
 }
 
-// The preset that was made for such data.
-const proposedPreset = ({ scenario }) => (!scenario ? "recording" : scenario === "static-observer" ? "static-flow" : "moving-flow");
+// The preset that was made for such data. Simulated data without a camera model has a camera for each room.
+const proposedPreset = ({ scenario, camera }) => (!scenario ? "recording" : scenario === "static-observer" ? "static-flow" : camera ? "moving-flow" : "rooms");
 
 // Lines KEY=VALUE as nested settings: sequence.batch_size=16 is { sequence: { batch_size: 16 } }.
 function settingsOf(lines, steps) {

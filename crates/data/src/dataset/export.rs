@@ -4,6 +4,7 @@
 
 mod bag;
 mod cdr;
+pub mod live;
 mod mcap;
 mod video;
 

@@ -28,6 +28,7 @@ use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
 use self::archive::UnpackedSource;
+pub use self::bag::live;
 pub use self::error::ImportError;
 use self::files::{extension, open_file};
 pub use self::options::{DEFAULT_DISK_MIB, DEFAULT_MAX_FILES, ImportConfig, ImportOptions, parse_size};

@@ -1,6 +1,8 @@
 //! The messages `Event` and `Summary` of TensorBoard in the wire format of Protocol Buffers, as far as scalars and pictures need
 //! them.
 
+use foreframe_data::protobuf::{bytes_of, number_of};
+
 /// What every file begins with.
 const FILE_VERSION: &str = "brain.Event:2";
 
@@ -122,63 +124,14 @@ impl EventMessage {
 
     /// Its step.
     pub(super) fn step(&self) -> Option<usize> {
-        match field(&self.0, EVENT_STEP)? {
-            WireValue::Number(step) => usize::try_from(step).ok(),
-            WireValue::Bytes(_) => None,
-        }
+        usize::try_from(number_of(&self.0, EVENT_STEP)?).ok()
     }
 
     /// The tag of its first value.
     pub(super) fn tag(&self) -> Option<&str> {
-        let value = inner(inner(&self.0, EVENT_SUMMARY)?, SUMMARY_VALUE)?;
-        std::str::from_utf8(inner(value, VALUE_TAG)?).ok()
+        let value = bytes_of(bytes_of(&self.0, EVENT_SUMMARY)?, SUMMARY_VALUE)?;
+        std::str::from_utf8(bytes_of(value, VALUE_TAG)?).ok()
     }
-}
-
-/// The value of a field.
-enum WireValue<'a> {
-    Number(u64),
-    Bytes(&'a [u8]),
-}
-
-/// The bytes of a field of a message.
-fn inner(message: &[u8], wanted: u32) -> Option<&[u8]> {
-    match field(message, wanted)? {
-        WireValue::Bytes(bytes) => Some(bytes),
-        WireValue::Number(_) => None,
-    }
-}
-
-/// The first field of that number.
-fn field(mut message: &[u8], wanted: u32) -> Option<WireValue<'_>> {
-    loop {
-        let key = take_varint(&mut message)?;
-        let value = match key & 7 {
-            VARINT => WireValue::Number(take_varint(&mut message)?),
-            BYTES => {
-                let length = usize::try_from(take_varint(&mut message)?).ok()?;
-                WireValue::Bytes(message.split_off(..length)?)
-            }
-            FIXED_64 => WireValue::Bytes(message.split_off(..8)?),
-            FIXED_32 => WireValue::Bytes(message.split_off(..4)?),
-            _ => return None,
-        };
-        if key >> 3 == u64::from(wanted) {
-            return Some(value);
-        }
-    }
-}
-
-fn take_varint(message: &mut &[u8]) -> Option<u64> {
-    let mut value = 0;
-    for place in 0..10 {
-        let byte = *message.split_off_first()?;
-        value |= u64::from(byte & 0x7f) << (7 * place);
-        if byte < 0x80 {
-            return Some(value);
-        }
-    }
-    None
 }
 
 #[cfg(test)]

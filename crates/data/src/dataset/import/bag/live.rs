@@ -1,0 +1,135 @@
+//! Messages of a running robot, one by one: the types that bags have, in CDR, and the images of Foxglove in Protocol Buffers.
+
+use super::messages::{self, RosType};
+use super::pixels::RawImage;
+use crate::protobuf::{bytes_of, number_of};
+use foreframe_core::frame::{Frame, codec};
+
+/// What the messages of a topic are for a prediction.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum LiveRole {
+    /// A camera's images.
+    Image,
+    /// What the robot is told to do: by default the action.
+    Command,
+    /// What the robot measures: by default the state.
+    Measurement,
+}
+
+/// A type of messages that can be read.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct LiveType(MessageDecoder);
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum MessageDecoder {
+    Ros(RosType),
+    FoxgloveRawImage,
+    FoxgloveCompressedImage,
+}
+
+/// A number of a message by its name, as `linear.x`.
+#[derive(Clone, Debug, PartialEq)]
+pub struct LiveValue {
+    /// Its name.
+    pub name: String,
+    /// Its value, in the unit of the type (m, m/s, rad, rad/s).
+    pub value: f64,
+}
+
+// Numbers of fields of `foxglove.RawImage` and `foxglove.CompressedImage`.
+const RAW_WIDTH: u32 = 2;
+const RAW_HEIGHT: u32 = 3;
+const RAW_ENCODING: u32 = 4;
+const RAW_STEP: u32 = 5;
+const RAW_DATA: u32 = 6;
+const COMPRESSED_DATA: u32 = 2;
+
+impl LiveType {
+    /// By the encoding of a topic's messages and the name of their type; `None` if they cannot be read.
+    #[must_use]
+    pub fn of(encoding: &str, type_name: &str) -> Option<Self> {
+        let decoder = match (encoding, type_name) {
+            ("protobuf", "foxglove.RawImage") => MessageDecoder::FoxgloveRawImage,
+            ("protobuf", "foxglove.CompressedImage") => MessageDecoder::FoxgloveCompressedImage,
+            ("cdr", ros) => MessageDecoder::Ros(RosType::of(ros)),
+            _ => return None,
+        };
+        let found = Self(decoder);
+        found.role().map(|_| found)
+    }
+
+    /// What it is used for by default; `None` if it is not used.
+    #[must_use]
+    pub fn role(self) -> Option<LiveRole> {
+        match self.0 {
+            MessageDecoder::Ros(kind) if kind.is_image() => Some(LiveRole::Image),
+            MessageDecoder::Ros(kind) if kind.is_command() => Some(LiveRole::Command),
+            MessageDecoder::Ros(kind) if kind.is_measurement() => Some(LiveRole::Measurement),
+            MessageDecoder::Ros(_) => None,
+            MessageDecoder::FoxgloveRawImage | MessageDecoder::FoxgloveCompressedImage => Some(LiveRole::Image),
+        }
+    }
+
+    /// The image of a message, in gray. Errors: why it cannot be read.
+    pub fn image(self, message: &[u8]) -> Result<Frame, String> {
+        let file = match self.0 {
+            MessageDecoder::Ros(RosType::Image) => return messages::image(message)?.1.gray(),
+            MessageDecoder::FoxgloveRawImage => return raw_image(message)?.gray(),
+            MessageDecoder::Ros(_) => messages::compressed_image(message)?.2,
+            MessageDecoder::FoxgloveCompressedImage => bytes_of(message, COMPRESSED_DATA).unwrap_or_default(),
+        };
+        codec::decode(file).map_err(|error| error.to_string())
+    }
+
+    /// The numbers of a message. Errors: why it cannot be read, or that it is an image.
+    pub fn values(self, message: &[u8]) -> Result<Vec<LiveValue>, String> {
+        let MessageDecoder::Ros(kind) = self.0 else {
+            return Err("it is an image, which has no numbers".to_owned());
+        };
+        let (_, values) = messages::values(kind, message)?;
+        let named = values.into_iter().map(|field| LiveValue {
+            name: field.name.into_owned(),
+            value: field.value,
+        });
+        Ok(named.collect())
+    }
+}
+
+fn raw_image(message: &[u8]) -> Result<RawImage<'_>, String> {
+    let number = |field| u32::try_from(number_of(message, field).unwrap_or(0)).unwrap_or(u32::MAX);
+    let encoding = bytes_of(message, RAW_ENCODING).unwrap_or_default();
+    Ok(RawImage {
+        width_px: number(RAW_WIDTH),
+        height_px: number(RAW_HEIGHT),
+        encoding: std::str::from_utf8(encoding).map_err(|_| "its encoding is no UTF-8 text".to_owned())?,
+        big_endian: false,
+        row_bytes: number(RAW_STEP),
+        bytes: bytes_of(message, RAW_DATA).unwrap_or_default(),
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_raw_image_of_foxglove_is_read() {
+        // As foxglove-sdk writes RawImage(width=3, height=2, encoding="mono8", step=3, data=b"abcdef").
+        let message = b"\x15\x03\0\0\0\x1d\x02\0\0\0\x22\x05mono8\x2d\x03\0\0\0\x32\x06abcdef";
+        let kind = LiveType::of("protobuf", "foxglove.RawImage").unwrap();
+        let frame = kind.image(message).unwrap();
+        assert_eq!((frame.width(), frame.height(), frame.pixels()), (3, 2, &b"abcdef"[..]));
+        assert!(kind.image(&message[..20]).is_err() && kind.values(message).is_err());
+        assert!(kind.image(b"").unwrap_err().contains("its encoding is \"\""));
+    }
+
+    #[test]
+    fn types_are_known_by_encoding_and_name() {
+        let role = |encoding, name| LiveType::of(encoding, name).and_then(LiveType::role);
+        assert_eq!(role("cdr", "sensor_msgs/msg/CompressedImage"), Some(LiveRole::Image));
+        assert_eq!(role("cdr", "nav_msgs/msg/Odometry"), Some(LiveRole::Measurement));
+        assert_eq!(role("cdr", "geometry_msgs/msg/Twist"), Some(LiveRole::Command));
+        assert_eq!(role("json", "sensor_msgs/msg/Image"), None);
+        assert_eq!(role("cdr", "sensor_msgs/msg/Imu"), None);
+    }
+}

@@ -1,0 +1,132 @@
+//! The WebSocket to a robot.
+
+use std::io::ErrorKind;
+use std::net::{TcpStream, ToSocketAddrs as _};
+use std::time::Duration;
+
+use serde_json::Value;
+use tungstenite::client::IntoClientRequest as _;
+use tungstenite::http::HeaderValue;
+use tungstenite::http::header::SEC_WEBSOCKET_PROTOCOL;
+use tungstenite::{Message, WebSocket};
+
+use super::BridgeError;
+use super::protocol::{PublishedTopic, RobotData, RobotMessage, SUBPROTOCOLS, client_data};
+
+/// How long a connection may take to open, and a message to be taken by the robot.
+const TIMEOUT: Duration = Duration::from_secs(10);
+/// How long to wait for a message, between two looks at whether to stop.
+const WAIT: Duration = Duration::from_millis(200);
+/// The port of Foxglove's bridges.
+const DEFAULT_PORT: u16 = 8765;
+
+/// What came from a robot.
+pub(super) enum Incoming {
+    Message(RobotMessage),
+    Data {
+        subscription: u32,
+        time_ns: u64,
+        payload: Vec<u8>,
+    },
+}
+
+/// An open connection.
+pub(super) struct RobotConnection {
+    address: String,
+    socket: WebSocket<TcpStream>,
+}
+
+impl RobotConnection {
+    /// Errors: `Address`, `Connection`.
+    pub(super) fn open(address: &str) -> Result<Self, BridgeError> {
+        let wrong = || BridgeError::Address(address.to_owned());
+        let mut request = address.into_client_request().map_err(|_| wrong())?;
+        let uri = request.uri();
+        let (Some("ws"), Some(host)) = (uri.scheme_str(), uri.host()) else {
+            return Err(wrong());
+        };
+        let target = (
+            host.trim_matches(['[', ']']).to_owned(),
+            uri.port_u16().unwrap_or(DEFAULT_PORT),
+        );
+        let protocols = HeaderValue::from_static(SUBPROTOCOLS);
+        request.headers_mut().insert(SEC_WEBSOCKET_PROTOCOL, protocols);
+        let failed = |reason: String| BridgeError::Connection {
+            action: "connect to",
+            address: address.to_owned(),
+            reason,
+        };
+        let found = target.to_socket_addrs().map_err(|error| failed(error.to_string()))?;
+        let mut last = "its name has no address".to_owned();
+        for one in found {
+            match TcpStream::connect_timeout(&one, TIMEOUT).and_then(|stream| prepare(&stream).map(|()| stream)) {
+                Ok(stream) => {
+                    let opened = tungstenite::client(request, stream);
+                    let (socket, _) = opened.map_err(|error| failed(error.to_string()))?;
+                    let set = socket.get_ref().set_read_timeout(Some(WAIT));
+                    set.map_err(|error| failed(error.to_string()))?;
+                    let address = address.to_owned();
+                    return Ok(Self { address, socket });
+                }
+                Err(error) => last = error.to_string(),
+            }
+        }
+        Err(failed(last))
+    }
+
+    fn failed(&self, action: &'static str, error: &tungstenite::Error) -> BridgeError {
+        BridgeError::Connection {
+            action,
+            address: self.address.clone(),
+            reason: error.to_string(),
+        }
+    }
+
+    /// What comes next; `None` if nothing came for a while, or something that is not used. Errors: `Connection`, also when the robot
+    /// closes it.
+    pub(super) fn next(&mut self) -> Result<Option<Incoming>, BridgeError> {
+        let message = match self.socket.read() {
+            Ok(message) => message,
+            Err(tungstenite::Error::Io(error))
+                if matches!(
+                    error.kind(),
+                    ErrorKind::WouldBlock | ErrorKind::TimedOut | ErrorKind::Interrupted
+                ) =>
+            {
+                return Ok(None);
+            }
+            Err(error) => return Err(self.failed("read from", &error)),
+        };
+        Ok(match message {
+            // A text that is no message of the protocol is none that is used.
+            Message::Text(text) => serde_json::from_str(&text).ok().map(Incoming::Message),
+            Message::Binary(bytes) => RobotData::of(&bytes).map(|data| Incoming::Data {
+                subscription: data.subscription,
+                time_ns: data.time_ns,
+                payload: data.payload.to_vec(),
+            }),
+            _ => None,
+        })
+    }
+
+    /// Errors: `Connection`.
+    pub(super) fn send(&mut self, message: &Value) -> Result<(), BridgeError> {
+        self.write(Message::text(message.to_string()))
+    }
+
+    /// Sends data of one of the bridge's topics. Errors: `Connection`.
+    pub(super) fn publish(&mut self, topic: PublishedTopic, payload: &[u8]) -> Result<(), BridgeError> {
+        self.write(Message::binary(client_data(topic, payload)))
+    }
+
+    fn write(&mut self, message: Message) -> Result<(), BridgeError> {
+        let sent = self.socket.send(message);
+        sent.map_err(|error| self.failed("write to", &error))
+    }
+}
+
+fn prepare(stream: &TcpStream) -> std::io::Result<()> {
+    stream.set_nodelay(true)?;
+    stream.set_read_timeout(Some(TIMEOUT))?;
+    stream.set_write_timeout(Some(TIMEOUT))
+}

@@ -1,0 +1,107 @@
+//! `foreframe bridge`
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use super::error::CliError;
+use super::interrupt;
+use super::process::print_line;
+use super::settings::CommonArgs;
+use super::workspace::Workspace;
+use crate::bridge::{self, BridgeEvent, LiveStep, TopicNames};
+use foreframe_data::dataset::import::live::LiveRole;
+
+/// How often a line says how it goes.
+const LINE_EVERY: Duration = Duration::from_secs(5);
+
+/// Predict for a running robot that has a Foxglove bridge.
+///
+/// Subscribes the robot's camera and, if the model takes them, its command and odometry; predicts; and publishes on the robot, as messages
+/// of ROS 2: PREFIX/predicted (`CompressedImage`: the last predicted frame, with the time that it is of), PREFIX/error (Float64: mean
+/// squared error of what was predicted for the present frame) and `PREFIX/expected_error`. Images are sensor_msgs/msg/Image or
+/// `CompressedImage` in CDR, or foxglove.RawImage or `CompressedImage`. It ends when the robot closes the connection.
+#[derive(clap::Args)]
+#[command(after_help = "Examples:
+  foreframe bridge ws://192.168.1.20:8765 --model rooms
+  foreframe bridge ws://localhost:8765 --model mycar --image /camera/image_raw --action /cmd_vel --state /odom")]
+pub(super) struct BridgeArgs {
+    /// The robot's address, as ws://HOST:PORT
+    address: String,
+    /// The directory of a model, its name, or NAME@VERSION
+    #[arg(long)]
+    model: String,
+    /// The topic of the camera [default: the first one with images]
+    #[arg(long, value_name = "TOPIC")]
+    image: Option<String>,
+    /// The topic of the command [default: the first Twist or `TwistStamped`]
+    #[arg(long, value_name = "TOPIC")]
+    action: Option<String>,
+    /// The topic of the odometry [default: the first Odometry or `JointState`]
+    #[arg(long, value_name = "TOPIC")]
+    state: Option<String>,
+    /// What the names of the published topics begin with
+    #[arg(long, value_name = "PREFIX", default_value = "/foreframe")]
+    prefix: String,
+    #[command(flatten)]
+    settings: CommonArgs,
+}
+
+pub(super) fn run(args: BridgeArgs) -> Result<(), CliError> {
+    let workspace = Workspace::new(args.settings.start()?);
+    let (_, model) = workspace.load_model(&args.model)?;
+    let names = TopicNames {
+        image: args.image,
+        action: args.action,
+        state: args.state,
+        prefix: args.prefix,
+    };
+    let cancelled = interrupt::flag()?;
+    let mut log = BridgeLog::default();
+    bridge::run(
+        &args.address,
+        &names,
+        &Arc::new(model),
+        &mut |event| log.on_event(event),
+        &cancelled,
+    )?;
+    Ok(())
+}
+
+/// Prints what happens, and now and then how it goes.
+#[derive(Default)]
+struct BridgeLog {
+    frames: u64,
+    latest: LiveStep,
+    printed: Option<Instant>,
+}
+
+impl BridgeLog {
+    fn on_event(&mut self, event: BridgeEvent) {
+        let line = match event {
+            BridgeEvent::Connected(name) => format!("connected to \"{name}\""),
+            BridgeEvent::Subscribed { role, topic } => {
+                let what = match role {
+                    LiveRole::Image => "image",
+                    LiveRole::Command => "action",
+                    LiveRole::Measurement => "state",
+                };
+                format!("{what}: {topic}")
+            }
+            BridgeEvent::Predicted(step) => {
+                self.frames += 1;
+                self.latest = step;
+                if self.printed.is_some_and(|printed| printed.elapsed() < LINE_EVERY) {
+                    return;
+                }
+                self.printed = Some(Instant::now());
+                let error = self
+                    .latest
+                    .error
+                    .map_or(String::new(), |error| format!(", error {error:.4}"));
+                format!("{} frames{error}", self.frames)
+            }
+        };
+        // If standard output is closed, the bridge still works for the robot.
+        let _ = print_line(line);
+    }
+}

@@ -1,0 +1,121 @@
+"""`foreframe bridge` with a robot that the Foxglove SDK plays.
+
+    foxglove_bridge.py PROGRAM MODELS FRAMES
+"""
+
+import io
+import json
+import pathlib
+import re
+import struct
+import subprocess
+import sys
+import threading
+import time
+
+import foxglove
+import numpy
+from foxglove import Channel, Schema
+from foxglove.channels import CompressedImageChannel, RawImageChannel
+from foxglove.messages import CompressedImage, RawImage
+from foxglove.websocket import Capability, ServerListener
+from PIL import Image
+
+PERIOD_S = 0.2
+HORIZON = 5
+
+
+class Listener(ServerListener):
+    """What the bridge publishes, by topic."""
+
+    def __init__(self):
+        self.published = {}
+        self.came = threading.Condition()
+
+    def on_message_data(self, client, client_channel_id, data):
+        with self.came:
+            self.published.setdefault(client_channel_id, []).append(bytes(data))
+            self.came.notify_all()
+
+    def on_client_advertise(self, client, channel):
+        with self.came:
+            self.published[channel.id] = []
+            self.topics = {**getattr(self, "topics", {}), channel.topic: channel.id}
+            self.came.notify_all()
+
+    def of(self, topic):
+        return self.published[self.topics[topic]]
+
+    def wait(self, holds, what):
+        with self.came:
+            assert self.came.wait_for(holds, timeout=60), f"never: {what}"
+
+
+def twist(linear, angular):
+    return b"\0\1\0\0" + struct.pack("<6d", linear, 0, 0, 0, 0, angular)
+
+
+def odometry(x, y, cos, sin, linear, angular):
+    """Header, child frame, pose with covariance, twist with covariance; numbers start at multiples of their size."""
+    heading = numpy.arctan2(sin, cos)
+    head = struct.pack("<iI", 0, 0) + struct.pack("<I", 5) + b"odom\0" + b"\0" * 3 + struct.pack("<I", 5) + b"base\0"
+    head += b"\0" * (-len(head) % 8)
+    pose = struct.pack("<7d", x, y, 0, 0, 0, numpy.sin(heading / 2), numpy.cos(heading / 2)) + bytes(36 * 8)
+    return b"\0\1\0\0" + head + pose + struct.pack("<6d", linear, 0, 0, 0, 0, angular) + bytes(36 * 8)
+
+
+def picture(message):
+    return numpy.asarray(Image.open(io.BytesIO(message[message.index(b"\x89PNG") :]))) / 255
+
+
+def drive(program, models, frames, compressed):
+    """Plays the recorded frames as a robot, and compares what the bridge says of them."""
+    listener = Listener()
+    context = foxglove.Context()
+    server = foxglove.start_server(
+        name="test robot", port=0, capabilities=[Capability.ClientPublish], supported_encodings=["cdr"], server_listener=listener, context=context
+    )
+    camera = (CompressedImageChannel if compressed else RawImageChannel)("/camera", context=context)
+    # Only the names count for the bridge.
+    ros = lambda name: Schema(name=name, encoding="ros2msg", data=b"")
+    command = Channel("/cmd_vel", schema=ros("geometry_msgs/msg/Twist"), message_encoding="cdr", context=context)
+    odom = Channel("/odom", schema=ros("nav_msgs/msg/Odometry"), message_encoding="cdr", context=context)
+    bridge = subprocess.Popen(
+        [program, "bridge", f"ws://127.0.0.1:{server.port}", "--model", "moving-flow", "--models-dir", models], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    lines = [bridge.stdout.readline().strip() for _ in range(4)]
+    assert lines[0] == 'connected to "test robot"' and sorted(lines[1:]) == ["action: /cmd_vel", "image: /camera", "state: /odom"], lines
+    listener.wait(lambda: len(listener.published) == 3, "three topics")
+    # The subscriptions come after what the bridge says.
+    time.sleep(0.5)
+    recorded = json.loads((frames / "actions.json").read_text())
+    paths = sorted(frames.glob("*.png"), key=lambda path: int(re.findall(r"\d+", path.name)[-1]))
+    seen, start_ns = [], time.time_ns()
+    for index, path in enumerate(paths):
+        now_ns = start_ns + int(index * PERIOD_S * 1e9)
+        seen.append(numpy.asarray(Image.open(path).convert("L")))
+        height, width = seen[-1].shape
+        command.log(twist(*recorded["actions"][index]), log_time=now_ns)
+        odom.log(odometry(*recorded["states"][index]), log_time=now_ns)
+        image = CompressedImage(data=path.read_bytes(), format="png") if compressed else RawImage(width=width, height=height, encoding="mono8", step=width, data=seen[-1].tobytes())
+        camera.log(image, log_time=now_ns)
+        predictions = max(0, index + 1 - HORIZON + 1)
+        listener.wait(lambda: len(listener.of("/foreframe/predicted")) >= predictions, f"prediction {predictions}")
+    predicted = [picture(message) for message in listener.of("/foreframe/predicted")]
+    listener.wait(lambda: len(listener.of("/foreframe/error")) == len(predicted) - HORIZON, "the last error")
+    errors = [struct.unpack("<d", message[-8:])[0] for message in listener.of("/foreframe/error")]
+    truth = seen[2 * HORIZON - 1 :]
+    assert len(errors) == len(truth) > 0
+    for error, prediction, frame in zip(errors, predicted, truth):
+        own = float(numpy.mean((prediction - frame / 255) ** 2))
+        assert abs(error - own) < 1e-6, (error, own)
+    assert len(listener.of("/foreframe/expected_error")) == len(predicted)
+    mean, still = numpy.mean(errors), numpy.mean([numpy.mean((old / 255.0 - new / 255.0) ** 2) for old, new in zip(seen[HORIZON - 1 :], truth)])
+    print(f"{'compressed' if compressed else 'raw'} images: {len(predicted)} predictions, mean error {mean:.4f}; that of the last frame {still:.4f}")
+    assert mean < still
+    server.stop()
+    assert bridge.wait(timeout=30) == 1, bridge.stderr.read()
+
+
+for compressed in (True, False):
+    drive(sys.argv[1], sys.argv[2], pathlib.Path(sys.argv[3]), compressed)
