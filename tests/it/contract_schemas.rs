@@ -228,6 +228,8 @@ fn every_accepted_body_of_the_corpus_fits_its_schema() {
             "environments" => "/v1/environments",
             "sessions" => "/v1/sessions",
             "jobs" => "/v1/jobs",
+            // Its contract is the protocol's own.
+            "openenv" => continue,
             other => panic!("{other}"),
         };
         let body = serde_json::from_slice(&std::fs::read(&path).unwrap()).unwrap();
