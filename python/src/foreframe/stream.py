@@ -20,7 +20,7 @@ from .records import Answer, Camera, Prediction, Rollouts, Spec
 T = TypeVar("T")
 
 SUBPROTOCOL = "foreframe.v1.msgpack"
-#: The pauses between two attempts to connect, in seconds.
+#: The pauses between two attempts to connect, in seconds; the first attempt comes at once.
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.1, 2.0
 #: The server closes a stream for good only for these reasons.
 FINAL_REASONS = frozenset({"replaced", "deleted", "revoked", "too_long"})
@@ -105,7 +105,7 @@ class SessionFlow:
 
     def open(self) -> Flow[None]:
         """Connects, if it is not connected."""
-        deadline, pause = time.monotonic() + self._reconnect_s, FIRST_PAUSE_S
+        deadline, pause = time.monotonic() + self._reconnect_s, 0.0
         while not self._is_open:
             try:
                 yield from self._connect()
@@ -169,7 +169,7 @@ class SessionFlow:
         return found
 
     def _answered(self, message: dict[str, Any]) -> Flow[Mapping[str, Any]]:
-        deadline, pause = time.monotonic() + self._reconnect_s, FIRST_PAUSE_S
+        deadline, pause = time.monotonic() + self._reconnect_s, 0.0
         while True:
             try:
                 if not self._is_open:
@@ -182,12 +182,19 @@ class SessionFlow:
 
     def _exchange(self, message: dict[str, Any], seq: int) -> Flow[Mapping[str, Any]]:
         """Sends a frame; gives the answer to it. If the server knows the frame already, it answers again."""
+        yield from self._send(message, seq)
+        return (yield from self._answer())
+
+    def _send(self, message: dict[str, Any], seq: int) -> Flow[None]:
         try:
             yield Send(msgpack.packb({**message, "seq": seq - self._first_seq}))
         except Broken:
             # Why the server closed the socket stands in its last message; then this raises.
             while True:
                 yield from self._receive()
+
+    def _answer(self) -> Flow[Mapping[str, Any]]:
+        """The answer to the frame that was sent first of those without one."""
         while True:
             answer = yield from self._receive()
             if answer["type"] in ("prediction", "buffering", "overtaken"):
@@ -241,9 +248,12 @@ class SessionFlow:
                 raise
             raise Broken("the server that made the session is gone") from error
         self._first_seq = self.next_seq - len(self._context)
+        # All at once: each would wait for the answer to the one before.
         for index, message in enumerate(self._context):
             # Only the last of a full context is predicted from, and nobody reads that.
-            yield from self._exchange(_one_step(message), self._first_seq + index)
+            yield from self._send(_one_step(message), self._first_seq + index)
+        for _ in self._context:
+            yield from self._answer()
         self._replayed = bool(self._context)
         self._is_open = True
 
@@ -261,7 +271,7 @@ class SessionFlow:
         if time.monotonic() + seconds > deadline:
             raise ConnectionFailed(f"the stream broke, and {self._reconnect_s:g} s of attempts were in vain: {error}")
         yield Pause(seconds)
-        return min(2 * pause, LONGEST_PAUSE_S)
+        return min(max(2 * pause, FIRST_PAUSE_S), LONGEST_PAUSE_S)
 
     def _read(self, answer: Mapping[str, Any]) -> Answer:
         assert self.spec is not None
