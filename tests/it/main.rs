@@ -12,6 +12,7 @@ mod browser;
 mod calibration;
 mod cli;
 mod client;
+mod commands;
 mod config;
 mod connections;
 mod contract;
