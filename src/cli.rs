@@ -1,7 +1,7 @@
 //! The command line, one file for each subcommand, or for two that belong together. Exit code 2: the command cannot be
 //! carried out as it was given. Exit code 1: it failed. Exit code 130: it was interrupted.
 //!
-//! Subcommands do not use each other. What they share is, in the order in which it may use each other: `error`, `next_step`,
+//! Subcommands do not use each other. What they share is, in the order in which it may use each other: `error`, `new_key`, `next_step`,
 //! `process` and `progress`, `interrupt`, `table`, `scores`, `settings`, `output`, `admin_address`, `workspace`.
 
 mod admin_address;
@@ -9,6 +9,7 @@ mod backup;
 mod bridge;
 mod calibrate;
 mod collect;
+mod completions;
 mod config;
 mod error;
 mod evaluate;
@@ -17,8 +18,10 @@ mod healthcheck;
 mod import;
 mod inspect;
 mod interrupt;
+mod jobs;
 mod keys;
 mod models;
+mod new_key;
 mod next_step;
 mod output;
 mod predict;
@@ -33,6 +36,7 @@ mod train;
 mod worker;
 mod workspace;
 
+use std::ffi::OsString;
 use std::io::Write;
 use std::process::ExitCode;
 
@@ -45,11 +49,11 @@ use foreframe_data::dataset::silence_caught_panics;
 
 /// Predicts the next camera frames of a robot from its frames, its state and its actions.
 ///
-/// Without a command, it serves the models in ./models, like `foreframe serve`.
+/// Without a command, it serves the models in ./models, like `foreframe serve`, and takes the options of that.
 #[derive(Parser)]
 #[command(name = "foreframe", version, arg_required_else_help = false)]
 #[command(after_help = "Examples:
-  foreframe serve                                # serve the shipped models at http://127.0.0.1:8642
+  foreframe --port 9000                          # serve the shipped models at http://127.0.0.1:9000
   foreframe collect --trials 200                 # simulate a small data set
   foreframe train --preset static                # train a model on it
   foreframe predict --help                       # how to predict from image files")]
@@ -72,10 +76,12 @@ enum Command {
     Publish(publish::PublishArgs),
     Models(models::ModelsArgs),
     Keys(keys::KeysArgs),
+    Jobs(jobs::JobsArgs),
     Backup(backup::BackupArgs),
     Restore(backup::RestoreArgs),
     Config(config::ConfigArgs),
     Healthcheck(healthcheck::HealthcheckArgs),
+    Completions(completions::CompletionsArgs),
     Worker(worker::WorkerArgs),
     /// Run one job for a server or worker, which starts this command
     #[command(hide = true)]
@@ -89,13 +95,26 @@ enum Command {
 pub fn main() -> ExitCode {
     silence_caught_panics();
     program::announce();
-    let Err(error) = run(Cli::parse().command) else {
+    let arguments = with_command(std::env::args_os().collect());
+    let Err(error) = run(Cli::parse_from(arguments).command) else {
         return ExitCode::SUCCESS;
     };
-    let (sentence, code) = error.report();
+    let Some((sentence, code)) = error.report() else {
+        return ExitCode::SUCCESS;
+    };
     // If standard error is closed, there is nowhere left to report to.
     let _ = writeln!(std::io::stderr(), "{}", printable(&sentence));
     code
+}
+
+/// The arguments with the default command where they begin with one of its options, as in `foreframe --port 9000`.
+fn with_command(mut arguments: Vec<OsString>) -> Vec<OsString> {
+    let is_own = |option: &str| ["--help", "-h", "--version", "-V"].contains(&option);
+    let first = arguments.get(1).and_then(|argument| argument.to_str());
+    if first.is_some_and(|first| first.starts_with('-') && !is_own(first)) {
+        arguments.insert(1, "serve".into());
+    }
+    arguments
 }
 
 fn run(command: Option<Command>) -> Result<(), CliError> {
@@ -112,6 +131,8 @@ fn run(command: Option<Command>) -> Result<(), CliError> {
         Command::Models(args) => models::run(&args),
         Command::Worker(args) => worker::run(&args),
         Command::Keys(args) => keys::run(&args),
+        Command::Jobs(args) => jobs::run(&args),
+        Command::Completions(args) => completions::run(&args),
         Command::Backup(args) => backup::run(&args),
         Command::Restore(args) => backup::run_restore(&args),
         Command::Config(args) => config::run(&args),
@@ -161,7 +182,7 @@ mod tests {
             assert!(!examples.is_empty(), "the help of {name} has no example");
             for example in examples {
                 let words = example.split([' ', '#', '>']).take_while(|word| !word.is_empty());
-                let parsed = Cli::try_parse_from(words.clone());
+                let parsed = Cli::try_parse_from(with_command(words.clone().map(OsString::from).collect()));
                 if let Err(error) = parsed
                     && error.kind() != clap::error::ErrorKind::DisplayHelp
                 {

@@ -71,6 +71,9 @@ pub struct Config {
     pub admin_bind: Option<SocketAddr>,
     /// Whether to accept requests from other machines although no API key exists.
     pub insecure: bool,
+    /// Whether to create an API key and print it once, if a key is required and none was ever created. Its scope is admin: use it
+    /// to look around, then create a key for each caller and revoke it.
+    pub first_key: bool,
     /// The format of log lines: `text` or `json`.
     #[schema(value_type = String)]
     pub log_format: LogFormat,
@@ -88,6 +91,7 @@ impl Default for Config {
             port: None,
             admin_bind: Some(SocketAddr::from((Ipv4Addr::LOCALHOST, DEFAULT_ADMIN_PORT))),
             insecure: false,
+            first_key: false,
             log_format: LogFormat::Text,
             otlp_endpoint: None,
             server: ServerConfig::default(),
@@ -115,9 +119,16 @@ impl LoadedConfig {
     /// Reads the file (`file`, or [`DEFAULT_FILE`] if it exists) and the environment, and puts the flags over them.
     /// Errors: see [`LoadedConfig::from_layers`].
     pub fn read(file: Option<&Path>, flags: Vec<SettingsLayer>) -> Result<Self, ConfigError> {
+        Self::read_over(file.map(SettingsLayer::file).transpose()?, flags)
+    }
+
+    /// The same with the settings of a file that was read already.
+    pub fn read_over(file: Option<SettingsLayer>, flags: Vec<SettingsLayer>) -> Result<Self, ConfigError> {
         let default = Path::new(DEFAULT_FILE);
-        let file = file.or_else(|| default.is_file().then_some(default));
-        let file = file.map(SettingsLayer::file).transpose()?;
+        let file = match file {
+            None if default.is_file() => Some(SettingsLayer::file(default)?),
+            file => file,
+        };
         // A variable that is not Unicode cannot be a setting.
         let variables = std::env::vars_os();
         let texts = variables.filter_map(|(name, text)| Some((name.into_string().ok()?, text.into_string().ok()?)));
@@ -195,6 +206,12 @@ impl LoadedConfig {
         let entry = |field: &str| (field.to_owned(), print::json_entry(&self.values, field));
         fields.keys().map(|field| entry(field)).collect()
     }
+}
+
+/// Whether there is a setting of that name.
+#[must_use]
+pub fn is_setting(name: &str) -> bool {
+    defaults().keys().any(|setting| setting == name)
 }
 
 /// Every setting with its default.

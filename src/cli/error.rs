@@ -18,6 +18,8 @@ pub(super) enum CliError {
     Failed(String),
     /// The user interrupted it; finished work is kept.
     Interrupted(String),
+    /// Nobody reads its output any more, as after `| head -1`.
+    OutputClosed,
 }
 
 impl CliError {
@@ -46,12 +48,14 @@ impl CliError {
         }
     }
 
-    /// The line for standard error and the exit code: 2 for `Usage`, 1 for `Failed`, 130 for `Interrupted`.
-    pub(super) fn report(&self) -> (String, ExitCode) {
+    /// The line for standard error and the exit code: 2 for `Usage`, 1 for `Failed`, 130 for `Interrupted`. None if there is
+    /// nothing to report.
+    pub(super) fn report(&self) -> Option<(String, ExitCode)> {
         match self {
-            Self::Usage(sentence) => (format!("error: {sentence}"), ExitCode::from(2)),
-            Self::Failed(sentence) => (format!("error: {sentence}"), ExitCode::from(1)),
-            Self::Interrupted(sentence) => (sentence.clone(), ExitCode::from(130)),
+            Self::Usage(sentence) => Some((format!("error: {sentence}"), ExitCode::from(2))),
+            Self::Failed(sentence) => Some((format!("error: {sentence}"), ExitCode::from(1))),
+            Self::Interrupted(sentence) => Some((sentence.clone(), ExitCode::from(130))),
+            Self::OutputClosed => None,
         }
     }
 }

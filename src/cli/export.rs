@@ -28,7 +28,7 @@ use foreframe_train::evaluation::figures::animation::enlarged_gif;
 #[command(after_help = "Examples:
   foreframe export --dataset moving-observer --episode 3 --out look
   foreframe export --dataset static-observer --first 5 --count 10 --out part
-  foreframe export --dataset mycar --to lerobot --videos --out mycar-lerobot
+  foreframe export --dataset mycar --to lerobot --videos --robot-type donkeycar --out mycar-lerobot
   foreframe export --dataset mycar --to mcap --out mycar.mcap
   foreframe export --dataset mycar --to mp4 --episode 2 --out look.mp4")]
 pub(super) struct ExportArgs {
@@ -42,6 +42,9 @@ pub(super) struct ExportArgs {
     /// With --to lerobot: store the frames as H.264 videos (needs ffmpeg; without masks) instead of PNG images
     #[arg(long)]
     videos: bool,
+    /// With --to lerobot: the robot, as `LeRobot` names it [default: turtlebot for simulated data, else unknown]
+    #[arg(long, value_name = "NAME")]
+    robot_type: Option<String>,
     /// The episode's number, counted from 0 [default: 0; with --to mcap, all]
     #[arg(long)]
     episode: Option<usize>,
@@ -74,8 +77,10 @@ pub(super) fn run(args: &ExportArgs) -> Result<(), CliError> {
             "--to lerobot writes the whole data set; leave out --episode, --first and --count".to_owned(),
         ));
     }
-    if args.to != ExportFormat::Lerobot && args.videos {
-        return Err(CliError::Usage("--videos goes with --to lerobot only".to_owned()));
+    for (option, is_given) in [("--videos", args.videos), ("--robot-type", args.robot_type.is_some())] {
+        if args.to != ExportFormat::Lerobot && is_given {
+            return Err(CliError::Usage(format!("{option} goes with --to lerobot only")));
+        }
     }
     let workspace = Workspace::new(args.settings.start()?);
     let (dir, dataset) = workspace.open_dataset(&args.dataset)?;
@@ -121,9 +126,9 @@ fn selected(args: &ExportArgs, dir: &Path, dataset: &Dataset) -> Result<Range<us
 fn write_lerobot(args: &ExportArgs, dataset: &Dataset) -> Result<(), CliError> {
     let output = OutputDirectory::create(&args.out)?;
     if args.videos {
-        to_lerobot_videos(dataset, output.path())?;
+        to_lerobot_videos(dataset, output.path(), args.robot_type.as_deref())?;
     } else {
-        to_lerobot_images(dataset, output.path())?;
+        to_lerobot_images(dataset, output.path(), args.robot_type.as_deref())?;
     }
     output.finish()?;
     let info = dataset.info();

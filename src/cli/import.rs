@@ -123,11 +123,11 @@ fn next_steps(out: &Path, info: &DatasetInfo, flags: &str) -> Result<(), CliErro
             info.frame_count, info.episode_count
         ));
     }
-    let settings = [format!("name={}", name_from(&info.name, "recording"))];
-    let settings = settings.into_iter().chain(conditioning(info));
-    let settings: String = settings.map(|setting| format!(" --set {setting}")).collect();
+    let mut settings = vec![format!("name={}", name_from(&info.name, "recording"))];
+    settings.extend(conditioning(info));
+    let settings = settings.join(" --set ");
     print_line(format!(
-        "      foreframe train --preset {PRESET} --dataset {dataset}{settings}{flags}"
+        "      foreframe train --preset {PRESET} --dataset {dataset} --set {settings}{flags}"
     ))
 }
 

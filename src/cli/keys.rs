@@ -1,11 +1,11 @@
 //! `foreframe keys`
 
 use super::error::CliError;
+use super::new_key::{KeyOrder, create_key};
 use super::process::print_line;
 use super::settings::{CommonArgs, open_store};
 use super::workspace::block_on;
-use crate::server::keys::NewKey;
-use foreframe_jobs::store::{Author, KeyRow, KeyScope, Store};
+use foreframe_jobs::store::{Author, KeyScope, Store};
 
 const SECONDS_PER_DAY: f64 = 86_400.0;
 
@@ -63,6 +63,9 @@ struct CreateArgs {
 
 pub(super) fn run(args: &KeysArgs) -> Result<(), CliError> {
     let config = args.settings.start()?;
+    if matches!(args.action, KeysCommand::List) && !config.server.store().exists() {
+        return print_line("there are no keys");
+    }
     block_on(async {
         let store = open_store(&config).await?;
         match &args.action {
@@ -80,20 +83,13 @@ async fn create(store: &Store, args: &CreateArgs) -> Result<(), CliError> {
             "{name:?} is not a name for a key; use one line of 1 to 64 bytes"
         )));
     }
-    let key = NewKey::generate().map_err(CliError::failed)?;
-    let now_s = store.now_s().await?;
-    let row = KeyRow {
-        id: key.id.clone(),
-        name: name.to_owned(),
-        hash: key.hash,
-        created_s: now_s,
-        revoked_s: None,
+    let order = KeyOrder {
+        name,
         scope: args.scope,
-        expires_s: args.expires.map(|seconds| now_s + seconds),
+        valid_s: args.expires,
         requests_per_s: args.rate,
     };
-    store.add_key(row, &Author::CommandLine).await?;
-    print_line(key.text)
+    print_line(create_key(store, order).await?)
 }
 
 /// Seconds of a time such as `30d` or `12h`, up to a hundred years.

@@ -58,6 +58,10 @@ enum ModelsCommand {
 pub(super) fn run(args: &ModelsArgs) -> Result<(), CliError> {
     let loaded = args.settings.load()?;
     let workspace = Workspace::new(with_checked_directories(loaded)?);
+    if let (ModelsCommand::List { json }, false) = (&args.action, workspace.config.server.store().exists()) {
+        // Nothing was published, and a list makes no database.
+        return print_list(&workspace, shipped(&workspace)?, *json);
+    }
     block_on(async {
         let versions = workspace.versions().await?;
         match &args.action {
@@ -101,6 +105,29 @@ async fn list(workspace: &Workspace, versions: &Versions, is_json: bool) -> Resu
             });
         }
     }
+    print_list(workspace, listed, is_json)
+}
+
+/// The versions that came with the program.
+fn shipped(workspace: &Workspace) -> Result<Vec<ListedVersion>, CliError> {
+    let models_dir = &workspace.config.server.models_dir;
+    let mut listed = Vec::new();
+    for (name, _) in registry::list(models_dir)? {
+        let manifest = registry::find(models_dir, &name).and_then(|dir| registry::manifest::read(&dir));
+        // A manifest that cannot be read is no version, as for a server.
+        listed.extend(manifest.ok().map(|manifest| ListedVersion {
+            directory: models_dir.join(&name),
+            name,
+            version: manifest.version,
+            active: true,
+            shipped: true,
+        }));
+    }
+    Ok(listed)
+}
+
+fn print_list(workspace: &Workspace, listed: Vec<ListedVersion>, is_json: bool) -> Result<(), CliError> {
+    let server = &workspace.config.server;
     if is_json {
         return print_line(serde_json::to_string_pretty(&listed).map_err(CliError::failed)?);
     }

@@ -89,7 +89,7 @@ mod tests {
     use super::*;
 
     fn created(target: &Path) -> OutputDirectory {
-        OutputDirectory::create(target).unwrap_or_else(|error| panic!("{}", error.report().0))
+        OutputDirectory::create(target).unwrap_or_else(|error| panic!("{:?}", error.report()))
     }
 
     #[test]

@@ -1,7 +1,7 @@
 //! The process as its user sees it: how it was started, and what it prints.
 
 use std::fmt::Display;
-use std::io::Write as _;
+use std::io::{ErrorKind, Write as _};
 
 use super::error::CliError;
 use super::next_step::shell_word;
@@ -9,8 +9,11 @@ use foreframe_core::error_text::printable;
 
 /// Writes a line to standard output.
 pub(super) fn print_line(line: impl Display) -> Result<(), CliError> {
-    writeln!(std::io::stdout(), "{}", printable(&line.to_string()))
-        .map_err(|error| CliError::Failed(format!("could not write to standard output: {error}")))
+    let written = writeln!(std::io::stdout(), "{}", printable(&line.to_string()));
+    written.map_err(|error| match error.kind() {
+        ErrorKind::BrokenPipe => CliError::OutputClosed,
+        _ => CliError::Failed(format!("could not write to standard output: {error}")),
+    })
 }
 
 /// The command line as it was given; reports and manifests record it.

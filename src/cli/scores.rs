@@ -73,7 +73,7 @@ mod tests {
     #[test]
     fn a_row_has_what_is_known() {
         let known = json!({"skill": 0.0373, "skill_interval_95": [-0.18, 0.28], "skill_interval_is_reliable": false,
-            "mse": 0.0021954, "ssim": 0.79, "blocks": 4, "windows": 179, "strongest_baseline": "ego-motion"});
+            "mse": 0.002_195, "ssim": 0.79, "blocks": 4, "windows": 179, "strongest_baseline": "ego-motion"});
         let expected = [
             "test",
             "0.037",

@@ -5,13 +5,14 @@ use tracing::{info, warn};
 
 use super::admin_address::{self, ADMIN_BIND};
 use super::error::CliError;
+use super::new_key::{KeyOrder, create_key};
 use super::process::print_line;
 use super::settings::{ServerArgs, open_store_waiting, with_checked_directories};
 use crate::config::Config;
 use crate::server::keys::Keys;
 use crate::server::{self, App, ServerListeners, ServerTls};
 use crate::telemetry;
-use foreframe_jobs::store::Store;
+use foreframe_jobs::store::{KeyScope, Store};
 
 /// Serve models over HTTP and WebSocket (the default command).
 ///
@@ -96,16 +97,34 @@ fn report_models(app: &App) {
     }
 }
 
+/// Creates a key and prints it; to standard output only, not to the log.
+async fn print_first_key(store: &Store) -> Result<(), CliError> {
+    let order = KeyOrder {
+        name: "first",
+        scope: KeyScope::Admin,
+        valid_s: None,
+        requests_per_s: None,
+    };
+    let key = create_key(store, order).await?;
+    print_line(format!(
+        "API key, printed this once: {key} — create others with foreframe keys create NAME, and then revoke this one"
+    ))
+}
+
 /// The API keys. Errors: `Usage` if other machines can reach the server and there is no key.
 async fn keys(config: &Config, store: Store) -> Result<Keys, CliError> {
     let is_required = config.is_exposed() && !config.insecure;
-    let keys = Keys::open(store, is_required).await?;
+    let mut keys = Keys::open(store.clone(), is_required).await?;
     if is_required && keys.count() == 0 {
-        return Err(CliError::Usage(format!(
-            "other machines can reach {}, but no API keys exist; create one with foreframe keys create NAME, bind a \
-             loopback address, or use --insecure",
-            config.bind
-        )));
+        if !config.first_key || store.keys_were_created() || !store.list_keys().await?.is_empty() {
+            return Err(CliError::Usage(format!(
+                "other machines can reach {}, but no valid API key exists; create one with foreframe keys create NAME, start with \
+                 --set first_key=true to get a first one, bind a loopback address, or use --insecure",
+                config.bind
+            )));
+        }
+        print_first_key(&store).await?;
+        keys = Keys::open(store, is_required).await?;
     }
     match keys.count() {
         0 if keys.are_required() => {

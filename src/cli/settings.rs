@@ -52,9 +52,11 @@ impl DirectoryArgs {
         given.collect()
     }
 
-    /// The configuration with these flags over everything else; starts the log.
-    pub(super) fn start(&self) -> Result<Config, CliError> {
-        start(LoadedConfig::read(None, flag_layers(self))?)
+    /// The configuration with a file's settings instead of those of foreframe.toml, if there are any, and with these flags and
+    /// the single settings over everything else; starts the log.
+    pub(super) fn start(&self, file: Option<SettingsLayer>, settings: Vec<SettingsLayer>) -> Result<Config, CliError> {
+        let flags = flag_layers(self).into_iter().chain(settings).collect();
+        start(LoadedConfig::read_over(file.filter(|file| !file.is_empty()), flags)?)
     }
 }
 

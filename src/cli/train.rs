@@ -10,6 +10,7 @@ use super::process::{command_line, print_line};
 use super::progress::ProgressLine;
 use super::settings::DirectoryArgs;
 use super::workspace::Workspace;
+use crate::config::is_setting;
 use foreframe_core::registry::StoredWeights;
 use foreframe_data::dataset::Dataset;
 use foreframe_train::evaluation;
@@ -31,8 +32,8 @@ use foreframe_train::training::{self, TrainConfig, Training, TrainingEvent, Trai
   foreframe train --preset rooms --dataset rooms-a --dataset rooms-b=0.3 --out runs/rooms")]
 pub(super) struct TrainArgs {
     /// paper (dense network, 1000 windows), static (dense, all windows), moving (dense, with state and actions), static-flow,
-    /// moving-flow (flow network; moving-flow takes state and actions), recording (flow network, with actions) or moving-mnist
-    /// (flow network, for the benchmark)
+    /// moving-flow (flow network; moving-flow takes state and actions), rooms (flow network with depth, for rooms of `collect --rooms
+    /// varied`), recording (flow network, with actions) or moving-mnist (flow network, for the benchmark)
     #[arg(long, default_value = "paper", conflicts_with = "from")]
     preset: String,
     /// Start from the weights and settings of this model: its directory, name or NAME@VERSION. A few hundred steps are often
@@ -47,10 +48,11 @@ pub(super) struct TrainArgs {
     /// The directory of the run, for the configuration, the checkpoint and at the end the model [default: runs/NAME]
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
-    /// A TOML file of training settings, which replace those of the preset
+    /// A TOML file of training settings, which replace those of the preset, and of settings of the program
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
-    /// One training setting, as in sequence.steps=3000; may be repeated, and replaces that of --config
+    /// One training setting, as in sequence.steps=3000, or one of the program, as in `dataset_memory_mib`=500; may be repeated, and
+    /// replaces that of --config
     #[arg(long = "set", value_name = "KEY=VALUE")]
     settings: Vec<String>,
     /// Print the training settings and stop
@@ -61,13 +63,14 @@ pub(super) struct TrainArgs {
 }
 
 pub(super) fn run(args: &TrainArgs) -> Result<(), CliError> {
-    let workspace = Workspace::new(args.directories.start()?);
+    let settings = GivenSettings::read(args)?;
+    let workspace = Workspace::new(args.directories.start(settings.program_file, settings.program)?);
     let start = args
         .from
         .as_ref()
         .map(|model| workspace.load_weights(model))
         .transpose()?;
-    let config = training_config(args, start.as_ref())?;
+    let config = training_config(args, start.as_ref(), settings.training)?;
     if args.print_config {
         return print_line(config.to_toml()?.trim_end());
     }
@@ -128,15 +131,38 @@ pub(super) fn run(args: &TrainArgs) -> Result<(), CliError> {
     }
 }
 
-/// The preset, or the settings of the model to start from, under the file of settings and the single settings.
-fn training_config(args: &TrainArgs, start: Option<&StoredWeights>) -> Result<TrainConfig, CliError> {
-    let mut layers = Vec::new();
-    if let Some(path) = &args.config {
-        layers.push(SettingsLayer::file(path)?);
+/// What --config and --set give. Both take settings of the program, which have one meaning in all commands, and of the training;
+/// no name is in both.
+#[derive(Default)]
+struct GivenSettings {
+    program_file: Option<SettingsLayer>,
+    program: Vec<SettingsLayer>,
+    training: Vec<SettingsLayer>,
+}
+
+impl GivenSettings {
+    fn read(args: &TrainArgs) -> Result<Self, CliError> {
+        let mut given = Self::default();
+        if let Some(path) = &args.config {
+            let (program, training) = SettingsLayer::file(path)?.partition(is_setting);
+            given.program_file = Some(program);
+            given.training.push(training);
+        }
+        for setting in &args.settings {
+            let (program, training) = SettingsLayer::assignment(setting)?.partition(is_setting);
+            given.program.push(program);
+            given.training.push(training);
+        }
+        Ok(given)
     }
-    for setting in &args.settings {
-        layers.push(SettingsLayer::assignment(setting)?);
-    }
+}
+
+/// The preset, or the settings of the model to start from, under the given settings.
+fn training_config(
+    args: &TrainArgs,
+    start: Option<&StoredWeights>,
+    layers: Vec<SettingsLayer>,
+) -> Result<TrainConfig, CliError> {
     Ok(match start {
         Some(start) => TrainConfig::of_model(&start.manifest, layers)?,
         None => TrainConfig::from_layers(&args.preset, layers)?,
@@ -272,6 +298,20 @@ fn index(stage: TrainingStage) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn no_name_is_a_setting_of_both_program_and_training() {
+        let training: toml::Table = TrainConfig::preset("paper")
+            .unwrap()
+            .to_toml()
+            .unwrap()
+            .parse()
+            .unwrap();
+        assert_eq!(
+            training.keys().filter(|name| is_setting(name)).collect::<Vec<_>>(),
+            [""; 0]
+        );
+    }
 
     #[test]
     fn sequence_shows_its_own_best_validation() {

@@ -253,7 +253,7 @@ fn contents_of_backup(backup: &Path) -> Vec<(PathBuf, Vec<u8>)> {
 fn a_backup_needs_a_store_and_a_directory_of_its_own() {
     let dir = tempfile::tempdir().unwrap();
     assert!(fail(dir.path(), &["backup", "b"]).contains("there is nothing to back up in data"));
-    succeed(dir.path(), &["keys", "list"]);
+    succeed(dir.path(), &["keys", "create", "ada"]);
     std::fs::create_dir(dir.path().join("full")).unwrap();
     std::fs::write(dir.path().join("full/file"), "").unwrap();
     assert!(fail(dir.path(), &["backup", "full"]).contains("full is not empty"));

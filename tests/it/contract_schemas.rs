@@ -95,7 +95,8 @@ fn every_job_body_fits_exactly_one_variant_of_its_schema() {
         json!({"kind": "import", "name": "a", "source": "mycar/data", "size": "96x64", "resize": "letterbox", "rate": 5.5,
             "every": 2, "action": ["/cmd_vel"], "unit": ["speed=m/s"], "hold": 0.5, "fov": 90.0, "tilt": -5.0,
             "camera_height": 0.2, "skip_bad": true}),
-        json!({"kind": "train", "name": "a", "preset": "paper", "dataset": "d", "settings": {"sequence": {"steps": 1}}}),
+        json!({"kind": "train", "name": "a", "preset": "paper", "dataset": "d", "settings": {"sequence": {"steps": 1}},
+            "after": "job-1"}),
         json!({"kind": "evaluate", "model": "a", "dataset": "d", "version": 1, "windows": 10}),
     ];
     let mismatches: Vec<_> = valid

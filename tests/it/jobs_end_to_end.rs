@@ -42,6 +42,50 @@ async fn collect_data_set(app: &App) -> Value {
     run_job(app, &seen).await
 }
 
+#[tokio::test]
+async fn jobs_wait_for_what_another_makes() {
+    let dir = tempfile::tempdir().unwrap();
+    let app = app(dir.path(), ServerConfig::default());
+    let after = |mut job: Value, earlier: &str| {
+        job["after"] = json!(earlier);
+        job
+    };
+    let collect = |name: &str| json!({"kind": "collect", "name": name, "scenario": "static-observer", "trials": 40});
+    let evaluate = json!({"kind": "evaluate", "model": "fresh", "dataset": "seen", "windows": 8, "resamples": 100});
+    for job in [
+        collect("seen"),
+        after(train("fresh", 2), "job-1"),
+        after(evaluate.clone(), "job-2"),
+    ] {
+        let taken = post(&app, JOBS, &job).await;
+        assert_eq!(taken.status, 202, "{}", taken.json());
+    }
+    let unknown = post(&app, JOBS, &after(train("fresh", 2), "job-9")).await;
+    assert_eq!(unknown.detail(422), "after: there is no job \"job-9\"");
+    let evaluated = poll_until(async || {
+        let job = get(&app, "/v1/jobs/job-3").await.json();
+        assert!(job["state"] != "failed", "{job}");
+        (job["state"] == "succeeded").then_some(job)
+    })
+    .await;
+    assert_eq!(evaluated["result"]["version"], 1);
+
+    // What waits for a job that did not succeed fails.
+    let long = json!({"kind": "collect", "name": "long", "scenario": "static-observer", "trials": 100_000});
+    assert_eq!(post(&app, JOBS, &long).await.status, 202);
+    let mut waiting = after(train("other", 2), "job-4");
+    waiting["dataset"] = json!("long");
+    assert_eq!(post(&app, JOBS, &waiting).await.status, 202);
+    assert_eq!(post(&app, "/v1/jobs/job-4/cancel", &json!({})).await.status, 202);
+    let failed = poll_until(async || {
+        let job = get(&app, "/v1/jobs/job-5").await.json();
+        (job["state"] == "failed").then_some(job)
+    })
+    .await;
+    let expected = "job-4, for which it waited, is cancelled; resume that one, then this one";
+    assert_eq!(failed["error"], expected);
+}
+
 async fn delete(app: &App, path: &str) -> Answer {
     send(app, Request::delete(path).body(Body::empty()).unwrap()).await
 }

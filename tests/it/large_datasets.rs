@@ -29,7 +29,7 @@ struct Stored {
 impl Stored {
     fn squares(episodes: usize, side: u32) -> Self {
         let dir = tempfile::tempdir().unwrap();
-        to_lerobot_images(&moving_squares(episodes, side, 0.2), &dir.path().join("set")).unwrap();
+        to_lerobot_images(&moving_squares(episodes, side, 0.2), &dir.path().join("set"), None).unwrap();
         Self { dir }
     }
 

@@ -169,10 +169,20 @@ fn an_export_with_images_is_the_same_data_set() {
     let dir = tempfile::tempdir().unwrap();
     let original = collected(dir.path());
     let out = dir.path().join("out");
-    to_lerobot_images(&original, &out).unwrap();
+    to_lerobot_images(&original, &out, Some("rover")).unwrap();
     let exported = Dataset::open(&out).unwrap();
     assert!(same_numbers(&original, &exported) && worst_difference(&original, &exported) == 0.0);
     assert_eq!(exported.mask(3).unwrap(), original.mask(3).unwrap());
+    let json = |name: &str| -> Value { serde_json::from_slice(&fs::read(out.join(name)).unwrap()).unwrap() };
+    let info = json("meta/info.json");
+    assert_eq!(info["robot_type"], "rover");
+    // LeRobot merges data sets whose statistics of images have the shape 3 × 1 × 1.
+    for key in ["observation.image", "observation.mask"] {
+        assert_eq!(info["features"][key]["shape"], json!([SIDE, SIDE, 3]));
+        let mean = json("meta/stats.json")[key]["mean"].clone();
+        let one = mean[0][0][0].as_f64().unwrap();
+        assert_eq!(mean, json!([[[one]], [[one]], [[one]]]));
+    }
 }
 
 #[test]
@@ -183,7 +193,7 @@ fn an_export_with_videos_is_read_back() {
     let dir = tempfile::tempdir().unwrap();
     let original = collected(dir.path());
     let (exported, back) = (dir.path().join("videos"), dir.path().join("back"));
-    to_lerobot_videos(&original, &exported).unwrap();
+    to_lerobot_videos(&original, &exported, None).unwrap();
     run(&exported, &back, ImportOptions::default()).unwrap();
     let dataset = Dataset::open(&back).unwrap();
     assert!(same_numbers(&original, &dataset));

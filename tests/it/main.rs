@@ -13,6 +13,7 @@ mod browser;
 mod calibration;
 mod cli;
 mod client;
+mod commands;
 mod config;
 mod connections;
 mod contract;

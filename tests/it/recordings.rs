@@ -221,12 +221,12 @@ pub(crate) fn dataset(frames: u32) -> Dataset {
 
 /// A data set of `LeRobot` with images in its tables.
 pub(crate) fn lerobot_images(path: &Path, frames: u32) {
-    to_lerobot_images(&dataset(frames), path).unwrap();
+    to_lerobot_images(&dataset(frames), path, None).unwrap();
 }
 
 /// A data set of `LeRobot` with videos. Needs ffmpeg.
 pub(crate) fn lerobot_videos(path: &Path, frames: u32) {
-    to_lerobot_videos(&dataset(frames), path).unwrap();
+    to_lerobot_videos(&dataset(frames), path, None).unwrap();
 }
 
 /// An MP4 file without gaps. Needs ffmpeg.

@@ -67,6 +67,7 @@ fn job(makes: Option<&str>, key: Option<&str>) -> NewJob {
         progress: "{}".to_owned(),
         idempotency_key: key.map(str::to_owned),
         submitter: String::new(),
+        after: None,
     }
 }
 

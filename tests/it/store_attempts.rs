@@ -15,6 +15,7 @@ async fn store(dir: &std::path::Path) -> Store {
         progress: "{}".to_owned(),
         idempotency_key: None,
         submitter: String::new(),
+        after: None,
     };
     store.enqueue(new, 10, 0.0).await.unwrap();
     store

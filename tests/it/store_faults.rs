@@ -23,6 +23,7 @@ async fn enqueue(store: &Store) -> Result<EnqueueResult, StoreError> {
         progress: "{}".to_owned(),
         idempotency_key: None,
         submitter: String::new(),
+        after: None,
     };
     store.enqueue(new, 1_000_000, 0.0).await
 }

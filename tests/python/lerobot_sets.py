@@ -197,7 +197,7 @@ def check_refused(program: str, source: Path, *expected: str) -> None:
 def check_export(program: str, dataset: Path, kind: str) -> None:
     """Exports an imported set, and reads it as LeRobot does: rows by the table of episodes, frames of videos by time."""
     out = dataset.parent / f"{dataset.name}-{kind}"
-    command = [program, "export", "--dataset", str(dataset), "--to", "lerobot", "--out", str(out)]
+    command = [program, "export", "--dataset", str(dataset), "--to", "lerobot", "--robot-type", "so100", "--out", str(out)]
     done = subprocess.run([*command, "--videos"] if kind == "videos" else command, capture_output=True, text=True)
     if done.returncode != 0:
         wrong.append(f"{out.name}: {done.stderr.strip()}")
@@ -206,6 +206,12 @@ def check_export(program: str, dataset: Path, kind: str) -> None:
     image = "observation.image"
     feature = described["features"][image]
     expect(feature["dtype"] == kind.rstrip("s"), f"{out.name}: dtype is {feature['dtype']}")
+    expect(feature["shape"] == [SIDE, SIDE, 3], f"{out.name}: shape is {feature['shape']}")
+    expect(described["robot_type"] == "so100", f"{out.name}: robot is {described['robot_type']}")
+    stats = json.loads((out / "meta/stats.json").read_text())[image]
+    shapes = {name: np.asarray(values).shape for name, values in stats.items()}
+    expected = {name: (3, 1, 1) for name in ("min", "max", "mean", "std")} | {"count": (1,)}
+    expect(shapes == expected, f"{out.name}: statistics have the shapes {shapes}")
     expect(described["fps"] == FPS and described["total_frames"] == sum(LENGTHS), f"{out.name}: {described}")
     columns = {key for key, value in described["features"].items() if value["dtype"] != "video"}
     for episode in pq.read_table(out / "meta/episodes/chunk-000/file-000.parquet").to_pylist():
@@ -226,7 +232,9 @@ def check_export(program: str, dataset: Path, kind: str) -> None:
             expect(abs(row["timestamp"] - i / FPS) < 1e-6, f"{out.name}: frame {i} is at {row['timestamp']} s")
             expect(np.allclose(row["action"], [number + i / 100, -i / 100], atol=1e-6), f"{out.name}: {row['action']}")
             if film is None:
-                pixels = np.asarray(Image.open(io.BytesIO(row[image]["bytes"])))
+                stored = Image.open(io.BytesIO(row[image]["bytes"]))
+                expect(stored.mode == "RGB", f"{out.name}: an image is {stored.mode}")
+                pixels = np.asarray(stored.convert("L"))
             else:
                 pixels = film[round((episode[f"videos/{image}/from_timestamp"] + row["timestamp"]) * FPS)]
             bar, left = int(pixels.mean(axis=0).argmax()), (i * 2) % (SIDE - 4)

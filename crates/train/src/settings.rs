@@ -167,6 +167,24 @@ impl SettingsLayer {
         self
     }
 
+    /// The values at the top level whose names are accepted, and the others.
+    #[doc(hidden)]
+    pub fn partition(mut self, is_accepted: impl Fn(&str) -> bool) -> (Self, Self) {
+        let others = self.values.extract_if(.., |name, _| !is_accepted(name)).collect();
+        let others = Self {
+            origin: self.origin.clone(),
+            values: others,
+        };
+        (self, others)
+    }
+
+    /// Whether it has no values.
+    #[doc(hidden)]
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.values.is_empty()
+    }
+
     /// Errors: `Renamed` if the top level has the old name of a setting.
     pub fn refuse_renamed(&self, old: &'static str, new: &'static str) -> Result<(), SettingsError> {
         if !self.values.contains_key(old) {

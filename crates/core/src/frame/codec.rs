@@ -81,6 +81,16 @@ pub fn encode_png(frame: &Frame) -> Result<Vec<u8>, FrameError> {
     Ok(bytes)
 }
 
+/// Encodes the frame as a PNG with red, green and blue, which are all its gray level. Errors: `Encode`.
+pub fn encode_rgb_png(frame: &Frame) -> Result<Vec<u8>, FrameError> {
+    let rgb: Vec<u8> = frame.pixels().iter().flat_map(|&gray| [gray; 3]).collect();
+    let mut bytes = Vec::new();
+    image::codecs::png::PngEncoder::new(&mut bytes)
+        .write_image(&rgb, frame.width(), frame.height(), ExtendedColorType::Rgb8)
+        .map_err(FrameError::Encode)?;
+    Ok(bytes)
+}
+
 /// Encodes the frames as a GIF that repeats forever, with `delay_ms` between two frames. Errors: `Encode`.
 pub fn encode_gif(frames: &[Frame], delay_ms: u32) -> Result<Vec<u8>, FrameError> {
     let mut bytes = Vec::new();
@@ -110,6 +120,7 @@ mod tests {
             let frame = Frame::new(width, height, pixels).unwrap();
             let png = encode_png(&frame).unwrap();
             prop_assert_eq!(dimensions(&png).unwrap(), (width, height));
+            prop_assert_eq!(decode(&encode_rgb_png(&frame).unwrap()).unwrap(), frame.clone());
             prop_assert_eq!(decode(&png).unwrap(), frame);
         }
 

@@ -16,28 +16,39 @@ use serde_json::{Value, json};
 pub use self::bag::{ACTION_TOPIC, IMAGE_TOPIC, STATE_TOPIC, to_mcap};
 pub use self::video::to_mp4;
 use super::store::files::write_atomically;
-use super::store::layout::{self, IMAGE, INFO, shard_location, shard_path};
+use super::store::layout::{self, IMAGE, INFO, MASK, shard_location, shard_path};
 use super::store::shard::{EncodedEpisode, ShardStart, batch, schema};
 use super::store::tables::EpisodeRow;
 use super::store::writer::{ShardWriter, shard_ranges, write_json, write_tables};
 use super::{Dataset, DatasetError, DatasetInfo, Episode, EpisodeData};
+use foreframe_core::frame::codec;
 
 const VIDEO_PATH: &str = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4";
 
-/// Writes an empty directory as a `LeRobot` data set of version 3 with images in its tables, which `foreframe` opens, too.
-/// Errors: `Encode`, `Build`, `Io`.
-pub fn to_lerobot_images(dataset: &Dataset, out: &Path) -> Result<(), DatasetError> {
+/// `LeRobot` works with color images: its tools want statistics of three channels, also of masks.
+const CHANNELS: usize = 3;
+
+/// Writes an empty directory as a `LeRobot` data set of version 3 with images in its tables, which `foreframe` opens, too. Without
+/// a `robot_type`, it is that of the simulator, or unknown. Errors: `Encode`, `Build`, `Io`.
+pub fn to_lerobot_images(dataset: &Dataset, out: &Path, robot_type: Option<&str>) -> Result<(), DatasetError> {
     let mut writer = ShardWriter::new(out, dataset.info().clone());
     for episodes in shards(dataset) {
-        let encoded = encoded(dataset, writer.info(), episodes)?;
+        let mut encoded = encoded(dataset, writer.info(), episodes)?;
+        for episode in &mut encoded {
+            for png in episode.images.iter_mut().chain(episode.masks.iter_mut().flatten()) {
+                *png = codec::encode_rgb_png(&codec::decode(png)?)?;
+            }
+        }
         writer.write(&encoded)?;
     }
-    writer.complete().map(drop)
+    let info = writer.complete()?;
+    let described = described(&info, robot_type, json!({"dtype": "image"}));
+    write_json(&out.join(INFO), &described)
 }
 
-/// Writes an empty directory as a `LeRobot` data set of version 3 with its frames as H.264 videos, without masks.
+/// The same with the frames as H.264 videos, without masks.
 /// Errors: `Usage`, `Program`, `Encode`, `Build`, `Io`.
-pub fn to_lerobot_videos(dataset: &Dataset, out: &Path) -> Result<(), DatasetError> {
+pub fn to_lerobot_videos(dataset: &Dataset, out: &Path, robot_type: Option<&str>) -> Result<(), DatasetError> {
     let info = DatasetInfo {
         has_masks: false,
         ..dataset.info().clone()
@@ -62,7 +73,7 @@ pub fn to_lerobot_videos(dataset: &Dataset, out: &Path) -> Result<(), DatasetErr
     }
     let rows = EpisodeRow::all(records.iter().map(|(shard, record)| (*shard, record)));
     write_tables(out, &info, &rows, Some(info.frame_period_s))?;
-    write_json(&out.join(INFO), &video_info(&info))
+    write_json(&out.join(INFO), &video_info(&info, robot_type))
 }
 
 /// The episodes of each shard.
@@ -96,7 +107,13 @@ fn encoded(dataset: &Dataset, info: &DatasetInfo, episodes: &[Episode]) -> Resul
             states: of_frames(Dataset::state),
             trial: episode.trial.clone(),
         };
-        EncodedEpisode::new(info, episode.index, data)
+        let mut encoded = EncodedEpisode::new(info, episode.index, data)?;
+        for (key, stats) in &mut encoded.record.stats {
+            if [IMAGE, MASK].contains(&key.as_str()) {
+                *stats = stats.in_channels(CHANNELS);
+            }
+        }
+        Ok(encoded)
     };
     episodes.iter().map(encode).collect()
 }
@@ -118,14 +135,10 @@ fn numbers(
 }
 
 /// `LeRobot`'s `info.json` of a data set with videos.
-fn video_info(info: &DatasetInfo) -> Value {
-    let mut described = layout::lerobot_info(info);
-    described["video_path"] = json!(VIDEO_PATH);
-    let fps = described["fps"].clone();
-    described["features"][IMAGE] = json!({
+fn video_info(info: &DatasetInfo, robot_type: Option<&str>) -> Value {
+    let fps = layout::lerobot_info(info)["fps"].clone();
+    let video = json!({
         "dtype": "video",
-        "shape": [info.frame_height_px, info.frame_width_px, 3],
-        "names": ["height", "width", "channels"],
         "info": {
             "video.height": info.frame_height_px,
             "video.width": info.frame_width_px,
@@ -133,9 +146,27 @@ fn video_info(info: &DatasetInfo) -> Value {
             "video.pix_fmt": "yuv420p",
             "video.is_depth_map": false,
             "video.fps": fps,
-            "video.channels": 3,
+            "video.channels": CHANNELS,
             "has_audio": false,
         },
     });
+    let mut described = described(info, robot_type, video);
+    described["video_path"] = json!(VIDEO_PATH);
+    described
+}
+
+/// `LeRobot`'s `info.json` with color images; `image` says how they are stored.
+fn described(info: &DatasetInfo, robot_type: Option<&str>, mut image: Value) -> Value {
+    let mut described = layout::lerobot_info(info);
+    if let Some(robot_type) = robot_type {
+        described["robot_type"] = json!(robot_type);
+    }
+    let shape = json!([info.frame_height_px, info.frame_width_px, CHANNELS]);
+    image["shape"] = shape.clone();
+    image["names"] = json!(["height", "width", "channels"]);
+    described["features"][IMAGE] = image;
+    if info.has_masks {
+        described["features"][MASK]["shape"] = shape;
+    }
     described
 }

@@ -46,9 +46,13 @@ impl JobMemory {
         }
     }
 
-    /// What a training will need, without starting it. Errors: `Invalid`, `NotFound`, and those of reading the data set.
+    /// What a training will need, without starting it. Errors: `Invalid`, `NotFound`, and those of reading the data sets.
     pub async fn estimate(self, spec: &TrainSpec, objects: &Objects) -> Result<TrainingEstimate, JobError> {
-        let (config, dataset) = (spec.config()?, datasets::describe(objects, &spec.dataset).await?);
+        let config = spec.config()?;
+        let mut dataset = datasets::describe(objects, &spec.dataset).await?;
+        for name in spec.mixture.keys() {
+            dataset.frame_count += datasets::describe(objects, name).await?.frame_count;
+        }
         Ok(TrainingEstimate {
             steps: config.pretrain.steps + config.sequence.steps,
             memory_mib: training_mib(&config, &dataset, self.held_mib()),
@@ -56,9 +60,9 @@ impl JobMemory {
         })
     }
 
-    /// Errors: `Invalid` if a training certainly needs more memory than a job can use.
-    pub(super) fn check(self, config: &TrainConfig, dataset: &DatasetInfo) -> Result<(), JobError> {
-        let (allowed, needed) = (self.limit_mib, training_mib(config, dataset, self.held_mib()));
+    /// Errors: `Invalid` if a training certainly needs more memory than a job can use, and those of an estimate.
+    pub(super) async fn check(self, spec: &TrainSpec, objects: &Objects) -> Result<(), JobError> {
+        let (allowed, needed) = (self.limit_mib, self.estimate(spec, objects).await?.memory_mib);
         if allowed == 0 || needed <= allowed {
             return Ok(());
         }

@@ -20,7 +20,7 @@ use super::memory::JobMemory;
 use super::report::JobReporter;
 use super::retry_policy::RetryPolicy;
 use super::spec::AvailableInputs;
-use super::{CollectSpec, EvaluateSpec, JobError, JobSpec, TrainSpec, datasets};
+use super::{CollectSpec, EvaluateSpec, Job, JobError, JobSpec, JobState, TrainSpec, datasets};
 use crate::store::{JobId, ModelMetrics, Store, StoreError};
 use crate::versions::{VersionError, Versions};
 use foreframe_core::error_text;
@@ -76,6 +76,9 @@ impl JobExecutor for Pipeline {
     }
 
     fn execute(&self, spec: &JobSpec, report: &JobReporter, cancelled: &AtomicBool) -> Result<JobResult, JobFailure> {
+        if let Some(after) = spec.after() {
+            self.check_earlier(after, &self.retry_policy(report, cancelled))?;
+        }
         let result = match spec {
             JobSpec::Collect(spec) => self.collect(spec, report, cancelled),
             JobSpec::Import(spec) => self.import(spec, report, cancelled),
@@ -97,7 +100,24 @@ impl Pipeline {
         {
             upload.fetch(objects).await?;
         }
-        let (datasets, models) = (datasets::names(objects).await?, self.versions.all().await?);
+        let (mut datasets, mut models) = (datasets::names(objects).await?, self.versions.all().await?);
+        let is_there = spec.datasets().into_iter().all(|name| datasets.contains(name));
+        // What the jobs before it will make; each has a smaller number than the next.
+        let mut after = spec.after();
+        while let Some(id) = after {
+            let row = self.store.job(id).await?;
+            if row.is_none() && spec.after() == Some(id) {
+                return Err(JobError::invalid("after", format!("there is no job \"{id}\"")));
+            }
+            // Ended jobs are forgotten after a while; what they made is there.
+            let Some(row) = row else { break };
+            let earlier = Job::of(&row)?.spec;
+            after = earlier.after();
+            datasets.extend(earlier.made_dataset().cloned());
+            if let Some(model) = earlier.made_model() {
+                models.entry(model.clone()).or_default();
+            }
+        }
         let (data_dir, import_dir) = (objects.data_dir().to_owned(), self.resources.import_dir.clone());
         let checked = spec.clone();
         // Reads the disk, so it runs on a blocking thread. It must not wait for other blocking work: there are few threads.
@@ -111,11 +131,31 @@ impl Pipeline {
         });
         checked.await.unwrap_or(Err(JobError::Stopping))?;
         let JobSpec::Train(spec) = spec else { return Ok(()) };
-        let mut dataset = datasets::describe(objects, &spec.dataset).await?;
-        for name in spec.mixture.keys() {
-            dataset.frame_count += datasets::describe(objects, name).await?.frame_count;
+        if !is_there {
+            // How much memory it needs is known when its data set is made.
+            return Ok(());
         }
-        self.resources.memory.check(&spec.config()?, &dataset)
+        self.resources.memory.check(spec, objects).await
+    }
+
+    /// Errors: `Failed` if the job that another waited for did not succeed.
+    fn check_earlier(&self, after: JobId, retry: &RetryPolicy<'_>) -> Result<(), JobFailure> {
+        match retry.run(async || self.store.job(after).await)? {
+            Some(row) if row.state != JobState::Succeeded.name() => Err(JobFailure::Failed(format!(
+                "{after}, for which it waited, is {}; resume that one, then this one",
+                row.state
+            ))),
+            // Without a row, the job ended long ago.
+            _ => Ok(()),
+        }
+    }
+
+    /// The version of a model that a job made, if it made one.
+    async fn made_version(&self, job: JobId, model: &ModelName) -> Result<Option<u32>, StoreError> {
+        let row = self.store.job(job).await?;
+        let outcome: Option<Value> = row.and_then(|row| serde_json::from_str(&row.outcome?).ok());
+        let made = outcome.filter(|outcome| outcome["model"] == model.as_str());
+        Ok(made.and_then(|made| u32::try_from(made["version"].as_u64()?).ok()))
     }
 
     fn collect(
@@ -213,7 +253,11 @@ impl Pipeline {
     ) -> Result<JobResult, JobFailure> {
         let retry = self.retry_policy(report, cancelled);
         let model = |name: &ModelName, version| retry.run(async || self.model(name, version).await);
-        let loaded = model(&spec.model, spec.version)?;
+        let version = match (spec.version, spec.after) {
+            (None, Some(after)) => retry.run(async || self.made_version(after, &spec.model).await)?,
+            (version, _) => version,
+        };
+        let loaded = model(&spec.model, version)?;
         let twin = spec.twin.as_ref().map(|twin| model(twin, None)).transpose()?;
         report.progress(0, 0, "reading the data set");
         let dataset = self.dataset(&spec.dataset, self.resources.memory.held_mib(), &retry)?;

@@ -73,6 +73,7 @@ impl Jobs {
             progress: json(&StoredProgress::default())?,
             idempotency_key: key,
             submitter: submitter.to_owned(),
+            after: spec.after(),
         };
         let now_s = shared.store.now_s().await?;
         match shared.store.enqueue(new, shared.limits.queued as i64, now_s).await? {

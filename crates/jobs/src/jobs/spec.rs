@@ -13,6 +13,7 @@ use serde::{Deserialize, Deserializer, Serialize};
 
 pub use self::import::ImportSpec;
 use super::JobError;
+use crate::store::JobId;
 use foreframe_core::error_text;
 use foreframe_core::types::{DatasetName, ModelName, Seed, ValueError};
 use foreframe_data::dataset::{self, CollectConfig, CollectionStatus, DatasetError};
@@ -92,6 +93,11 @@ pub struct TrainSpec {
     #[serde(default, skip_serializing_if = "serde_json::Map::is_empty")]
     #[schema(value_type = Object)]
     pub settings: serde_json::Map<String, serde_json::Value>,
+    /// Waits until the job with this id has ended, and fails if that has failed. The data set or model that it makes need not
+    /// exist yet.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schema(value_type = Option<String>, pattern = "^job-[0-9]{1,18}$")]
+    pub after: Option<JobId>,
 }
 
 /// The names of all presets.
@@ -111,7 +117,7 @@ pub struct EvaluateSpec {
     #[serde(deserialize_with = "model")]
     #[schema(value_type = String)]
     pub model: ModelName,
-    /// Its version; the active one by default.
+    /// Its version; by default the one that the job of `after` makes, or the active one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub version: Option<u32>,
     /// Name of a data set in the data directory.
@@ -133,6 +139,11 @@ pub struct EvaluateSpec {
     /// The random seed of the resamples and of the shuffled actions.
     #[serde(default)]
     pub seed: u64,
+    /// Waits until the job with this id has ended, and fails if that has failed. The data set or model that it makes need not
+    /// exist yet.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schema(value_type = Option<String>, pattern = "^job-[0-9]{1,18}$")]
+    pub after: Option<JobId>,
 }
 
 fn default_seed() -> u64 {
@@ -182,6 +193,25 @@ impl JobSpec {
             Self::Collect(spec) => Some(&spec.name),
             Self::Import(spec) => Some(&spec.name),
             Self::Train(_) | Self::Evaluate(_) => None,
+        }
+    }
+
+    /// The model of which it makes a version.
+    #[must_use]
+    pub fn made_model(&self) -> Option<&ModelName> {
+        match self {
+            Self::Train(spec) => Some(&spec.name),
+            Self::Collect(_) | Self::Import(_) | Self::Evaluate(_) => None,
+        }
+    }
+
+    /// The job that must end before this one starts.
+    #[must_use]
+    pub fn after(&self) -> Option<JobId> {
+        match self {
+            Self::Train(spec) => spec.after,
+            Self::Evaluate(spec) => spec.after,
+            Self::Collect(_) | Self::Import(_) => None,
         }
     }
 
@@ -409,6 +439,7 @@ mod tests {
             dataset: "d".parse().unwrap(),
             mixture: BTreeMap::new(),
             settings: serde_json::Map::new(),
+            after: None,
         };
         let error = spec.check(&[]).unwrap_err().to_string();
         assert!(error.starts_with("preset: ") && error.contains("moving"), "{error}");
@@ -427,6 +458,7 @@ mod tests {
                     .map(|&(name, weight)| (name.parse().unwrap(), weight))
                     .collect(),
                 settings: serde_json::Map::new(),
+                after: None,
             };
             spec.check(&known).map_err(|error| error.to_string())
         };

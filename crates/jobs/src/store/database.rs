@@ -36,6 +36,7 @@ const MIGRATIONS: &[(i64, &str, &str)] = &[
         "key scopes and audit",
         include_str!("migrations/0003_key_scopes_and_audit.sql"),
     ),
+    (4, "after", include_str!("migrations/0004_after.sql")),
 ];
 
 /// A parameter of a statement: `$1`, `$2`, …

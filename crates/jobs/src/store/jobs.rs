@@ -73,6 +73,8 @@ pub struct NewJob {
     pub idempotency_key: Option<String>,
     /// The id of the caller's API key; empty without a key.
     pub submitter: String,
+    /// The job that must end before this one starts.
+    pub after: Option<JobId>,
 }
 
 /// The result of enqueueing.
@@ -185,10 +187,20 @@ impl Store {
         }
         let sql = "UPDATE counters SET value = value + 1 WHERE name = 'job'";
         tx.execute(sql, values![]).await?;
-        let sql = "INSERT INTO jobs (number, kind, makes, state, spec, progress, idempotency_key, queued_s, submitter) \
-             SELECT value, $1, $2, 'queued', $3, $4, $5, $6, $7 FROM counters WHERE name = 'job' RETURNING *";
+        let sql = "INSERT INTO jobs (number, kind, makes, state, spec, progress, idempotency_key, queued_s, submitter, after_job) \
+             SELECT value, $1, $2, 'queued', $3, $4, $5, $6, $7, $8 FROM counters WHERE name = 'job' RETURNING *";
         let (output, key) = (new.exclusive_output, new.idempotency_key);
-        let values = values![new.kind, output, new.spec, new.progress, key, now_s, new.submitter];
+        let after = new.after.map(JobId::number);
+        let values = values![
+            new.kind,
+            output,
+            new.spec,
+            new.progress,
+            key,
+            now_s,
+            new.submitter,
+            after
+        ];
         let row = tx.first(sql, values).await?;
         let row: JobRow = row.ok_or(StoreError::Query(sqlx::Error::RowNotFound))?.read()?;
         let change = Author::of_key(&row.submitter).change("job.create", row.id);
@@ -253,7 +265,7 @@ impl Store {
         read_all(self.database.fetch(sql, values![]).await?)
     }
 
-    /// Claims a job that is queued or whose lease has expired, by the database's clock, for `lease_s` seconds. It is the oldest
+    /// Claims a job that is queued, and does not wait for another, or whose lease has expired, by the database's clock, for `lease_s` seconds. It is the oldest
     /// job of the submitter with the fewest running jobs; of several, of the one whose last job was claimed longest ago.
     /// Errors: `Query`.
     pub async fn claim(&self, owner: &str, lease_s: f64) -> Result<Option<(JobRow, Lease)>, StoreError> {
@@ -264,7 +276,9 @@ impl Store {
     /// As [`Self::claim`], at a given time. Errors: `Query`.
     pub async fn claim_at(&self, owner: &str, now_s: f64, until_s: f64) -> Result<Option<(JobRow, Lease)>, StoreError> {
         let mut tx = self.database.begin().await?;
-        let sql = "SELECT number FROM jobs WHERE state = 'queued' OR (state = 'running' AND lease_until_s < $1) ORDER BY \
+        let sql = "SELECT number FROM jobs WHERE (state = 'queued' AND NOT EXISTS (SELECT 1 FROM jobs AS earlier \
+             WHERE earlier.number = jobs.after_job AND earlier.state IN ('queued', 'running'))) \
+             OR (state = 'running' AND lease_until_s < $1) ORDER BY \
              (SELECT COUNT(*) FROM jobs AS other WHERE other.submitter = jobs.submitter \
              AND other.state = 'running' AND other.lease_until_s >= $1), \
              (SELECT COALESCE(MAX(other.claimed_s), 0) FROM jobs AS other WHERE other.submitter = jobs.submitter), \

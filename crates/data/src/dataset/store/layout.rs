@@ -195,7 +195,7 @@ fn one_line(text: &str) -> String {
 pub(crate) fn lerobot_info(info: &DatasetInfo) -> Value {
     json!({
         "codebase_version": "v3.0",
-        "robot_type": "turtlebot",
+        "robot_type": if info.scenario.is_some() { "turtlebot" } else { "unknown" },
         "total_episodes": info.episode_count,
         "total_frames": info.frame_count,
         "total_tasks": 1,

@@ -59,6 +59,18 @@ impl ChannelStats {
         Self::new(frames as u64, std::iter::once(component))
     }
 
+    /// The same for this many channels, each equal to the one that there is.
+    pub(crate) fn in_channels(&self, channels: usize) -> Self {
+        let components = |values: &[f64]| values.iter().copied().cycle().take(channels).collect();
+        Self {
+            min: components(&self.min),
+            max: components(&self.max),
+            mean: components(&self.mean),
+            std: components(&self.std),
+            count: self.count,
+        }
+    }
+
     /// Statistics of all parts together, each weighted by its number of frames.
     pub(crate) fn merged(parts: &[&Self]) -> Self {
         let size = parts.first().map_or(0, |part| part.mean.len());
