@@ -107,7 +107,7 @@ pub(crate) fn run(
     let mut prediction = LivePrediction::new(Arc::clone(model));
     while !cancelled.load(Ordering::Relaxed) {
         match robot.next()? {
-            None => {}
+            None | Some(Incoming::Message(RobotMessage::Other)) => {}
             Some(Incoming::Message(RobotMessage::ServerInfo { name, capabilities })) => {
                 if !capabilities.iter().any(|known| known == CLIENT_PUBLISH) {
                     return Err(BridgeError::NoPublishing(name));
@@ -124,7 +124,6 @@ pub(crate) fn run(
                 }
             }
             Some(Incoming::Message(RobotMessage::Unadvertise { channel_ids })) => topics.forget(&channel_ids),
-            Some(Incoming::Message(RobotMessage::Other)) => {}
             Some(Incoming::Data {
                 subscription,
                 time_ns,

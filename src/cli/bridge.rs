@@ -17,9 +17,9 @@ const LINE_EVERY: Duration = Duration::from_secs(5);
 /// Predict for a running robot that has a Foxglove bridge.
 ///
 /// Subscribes the robot's camera and, if the model takes them, its command and odometry; predicts; and publishes on the robot, as messages
-/// of ROS 2: PREFIX/predicted (`CompressedImage`: the last predicted frame, with the time that it is of), PREFIX/error (Float64: mean
-/// squared error of what was predicted for the present frame) and `PREFIX/expected_error`. Images are sensor_msgs/msg/Image or
-/// `CompressedImage` in CDR, or foxglove.RawImage or `CompressedImage`. It ends when the robot closes the connection.
+/// of ROS 2: PREFIX/predicted (a `CompressedImage`: the last predicted frame, with the time that it is of), PREFIX/error (a Float64: mean
+/// squared error of what was predicted for the present frame) and `PREFIX/expected_error`. Images are `sensor_msgs/msg/Image` or
+/// `CompressedImage` in CDR, or `foxglove.RawImage` or `CompressedImage`. It ends when the robot closes the connection.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   foreframe bridge ws://192.168.1.20:8765 --model rooms

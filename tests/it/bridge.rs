@@ -39,7 +39,6 @@ impl Robot {
             .unwrap();
         let (stream, _) = listener.accept().unwrap();
         stream.set_read_timeout(Some(TIMEOUT)).unwrap();
-        #[expect(clippy::result_large_err, reason = "the type of the callback is given")]
         let choose = |request: &Request, mut response: Response| {
             let offered = request.headers()["sec-websocket-protocol"].to_str().unwrap();
             assert!(offered.split(", ").any(|protocol| protocol == PROTOCOL), "{offered}");

@@ -115,7 +115,7 @@ async fn uploads_are_bounded_in_size_and_number() {
     };
     let app = app(dir.path(), config);
     let uploads = dir.path().join("uploads");
-    let endless = stream::repeat_with(|| Ok::<_, std::io::Error>(Bytes::from_static(&[7; 1 << 16])));
+    let endless = stream::repeat_with(|| Ok::<_, std::io::Error>(Bytes::from_static(&[7; 1 << 13])));
     let detail = upload(&app, "a.zip", Body::from_stream(endless)).await.detail(413);
     assert!(
         detail.contains("more than 1 MiB") && detail.contains("max_upload_mib"),

@@ -73,7 +73,7 @@ pub struct Training<'a> {
     pub config: &'a TrainConfig,
     /// The data set.
     pub dataset: &'a Dataset,
-    /// The run's directory. It contains `config.toml`, `checkpoint.safetensors`, event files for TensorBoard, after the first validation of
+    /// The run's directory. It contains `config.toml`, `checkpoint.safetensors`, event files for `TensorBoard`, after the first validation of
     /// the network `sample.png`, and at the end `history.json` and `model/`.
     pub run_dir: &'a Path,
     /// The command line, for the manifest.

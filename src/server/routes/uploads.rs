@@ -29,6 +29,12 @@ struct UploadQuery {
     name: String,
 }
 
+/// The bytes of a file.
+#[derive(utoipa::ToSchema)]
+#[schema(value_type = String, format = Binary)]
+#[expect(dead_code, reason = "only described; the handler reads the body piece by piece")]
+struct UploadedBytes(Vec<u8>);
+
 /// An uploaded file.
 #[derive(Debug, Serialize, utoipa::ToSchema)]
 struct Upload {
@@ -42,7 +48,7 @@ struct Upload {
 /// is deleted when its import has succeeded or failed, or if none begins within `upload_idle_ms`.
 #[utoipa::path(
     post, path = "/v1/uploads", params(UploadQuery),
-    request_body(content = Vec<u8>, content_type = "application/octet-stream", description = "The file"),
+    request_body(content = UploadedBytes, content_type = "application/octet-stream", description = "The file"),
     responses(
         (status = 201, description = "Received", body = Upload),
         (status = 413, description = "The file exceeds `max_upload_mib`"),

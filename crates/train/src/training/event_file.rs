@@ -1,4 +1,4 @@
-//! Event files as TensorBoard reads them, in a run's directory: scalars and pictures, each at a step of a stage.
+//! Event files as `TensorBoard` reads them, in a run's directory: scalars and pictures, each at a step of a stage.
 
 mod message;
 mod record;
@@ -15,7 +15,7 @@ use super::observer::TrainingStage;
 use foreframe_core::files::write_atomically;
 use foreframe_core::frame::{Frame, codec};
 
-/// By this, TensorBoard knows its files; the time in seconds since 1970 follows, so that their names are in the order of time.
+/// By this, `TensorBoard` knows its files; the time in seconds since 1970 follows, so that their names are in the order of time.
 const NAME: &str = "events.out.tfevents.";
 
 /// A file to which events are appended.
@@ -134,7 +134,7 @@ fn create(run_dir: &Path) -> Result<(PathBuf, File), TrainError> {
     Err(io_failed("write", run_dir)(ErrorKind::AlreadyExists.into()))
 }
 
-/// The time that TensorBoard shows; nothing else depends on it.
+/// The time that `TensorBoard` shows; nothing else depends on it.
 fn unix_s() -> f64 {
     let since_1970 = SystemTime::now().duration_since(UNIX_EPOCH);
     // A clock before 1970 gives 0.

@@ -1,4 +1,4 @@
-//! Where a training reports: to its observer, to an event file for TensorBoard, and with a sample prediction.
+//! Where a training reports: to its observer, to an event file for `TensorBoard`, and with a sample prediction.
 
 use std::time::Instant;
 

@@ -1,4 +1,4 @@
-//! The messages `Event` and `Summary` of TensorBoard in the wire format of Protocol Buffers, as far as scalars and pictures need
+//! The messages `Event` and `Summary` of `TensorBoard` in the wire format of Protocol Buffers, as far as scalars and pictures need
 //! them.
 
 use foreframe_data::protobuf::{bytes_of, number_of};

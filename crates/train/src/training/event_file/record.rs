@@ -1,4 +1,4 @@
-//! The frame around each event (TFRecord): its length, a checksum of the length, the event, and its checksum.
+//! The frame around each event (`TFRecord`): its length, a checksum of the length, the event, and its checksum.
 
 const LENGTH: usize = 8;
 const CHECKSUM: usize = 4;
@@ -29,7 +29,7 @@ fn crc32c(bytes: &[u8]) -> u32 {
     !bytes.iter().fold(!0, step)
 }
 
-/// The checksum as TFRecord has it. It is changed, because a checksum over data that holds its own checksum is weak.
+/// The checksum as `TFRecord` has it. It is changed, because a checksum over data that holds its own checksum is weak.
 fn masked(bytes: &[u8]) -> [u8; CHECKSUM] {
     let sum = crc32c(bytes);
     sum.rotate_right(15).wrapping_add(0xa282_ead8).to_le_bytes()

@@ -117,7 +117,7 @@ fn number(field: &[u8]) -> Option<u64> {
     match field {
         [first, rest @ ..] if first & 0x80 != 0 => {
             let (high, low) = rest.split_at_checked(rest.len().checked_sub(8)?)?;
-            let is_small = first.trailing_zeros() >= 7 && high.iter().all(|&byte| byte == 0);
+            let is_small = *first == 0x80 && high.iter().all(|&byte| byte == 0);
             is_small.then(|| low.iter().fold(0, |number, &byte| number << 8 | u64::from(byte)))
         }
         _ => {
