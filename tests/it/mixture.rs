@@ -81,7 +81,7 @@ fn data_sets_that_do_not_fit_are_refused() {
     );
     let error = refused(
         part("other", 3, |info| {
-            info.action_channels[1] = Channel::new("speed", "m/s")
+            info.action_channels[1] = Channel::new("speed", "m/s");
         }),
         1.0,
     );
