@@ -11,6 +11,9 @@ const axis = (label, options = {}) => ({
   stroke: () => color("--quiet"), grid: { stroke: () => color("--line"), width: 1 }, ticks: { stroke: () => color("--line"), width: 1 }, ...options,
 });
 
+// Losses reach far below 0.001. What is left out stays null.
+const LOGARITHMIC = { size: 58, values: (_, ticks) => ticks.map(tick => (tick === null ? null : `${+tick.toPrecision(2)}`)) };
+
 // A line across the chart at the place `x`.
 function drawMark(chart, x) {
   if (x === undefined) return;
@@ -33,7 +36,7 @@ export function Plot({ label, data, series, height = 150, x = "", y = "", log, s
     const made = new uPlot({
       width: place.current.clientWidth || 300, height, legend: { show: legend, live: false },
       scales: { x: { time: false }, y: { distr: log ? 3 : 1, range } },
-      axes: [axis(x, { size: 30 }), axis(y)], series: [{ label: x || "x" }, ...series.map(line)],
+      axes: [axis(x, { size: 30 }), axis(y, log ? LOGARITHMIC : {})], series: [{ label: x || "x" }, ...series.map(line)],
       bands: bands?.map(pair => ({ series: pair, fill: () => `${color("--blue")}22` })),
       cursor: { sync: sync && { key: sync, setSeries: false }, drag: { x: false, y: false }, points: { size: 6 } },
       hooks: { draw: [chart => drawMark(chart, marked.current)] },
