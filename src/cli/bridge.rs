@@ -17,13 +17,13 @@ const LINE_EVERY: Duration = Duration::from_secs(5);
 /// Predict for a running robot that has a Foxglove bridge.
 ///
 /// Subscribes the robot's camera and, if the model takes them, its command and odometry; predicts; and publishes on the robot, as messages
-/// of ROS 2: PREFIX/predicted (a `CompressedImage`: the last predicted frame, with the time that it is of), PREFIX/error (a Float64: mean
+/// of ROS 2: PREFIX/predicted (a CompressedImage: the last predicted frame, with the time that it is of), PREFIX/error (a Float64: mean
 /// squared error of what was predicted for the present frame) and `PREFIX/expected_error`. Images are `sensor_msgs/msg/Image` or
-/// `CompressedImage` in CDR, or `foxglove.RawImage` or `CompressedImage`. It ends when the robot closes the connection.
+/// CompressedImage in CDR, or `foxglove.RawImage` or CompressedImage. It ends when the robot closes the connection.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   foreframe bridge ws://192.168.1.20:8765 --model rooms
-  foreframe bridge ws://localhost:8765 --model mycar --image /camera/image_raw --action /cmd_vel --state /odom")]
+  foreframe bridge ws://localhost:8765 --model mycar --image /camera/image_raw --state /odom")]
 pub(super) struct BridgeArgs {
     /// The robot's address, as ws://HOST:PORT
     address: String,
@@ -33,10 +33,10 @@ pub(super) struct BridgeArgs {
     /// The topic of the camera [default: the first one with images]
     #[arg(long, value_name = "TOPIC")]
     image: Option<String>,
-    /// The topic of the command [default: the first Twist or `TwistStamped`]
+    /// The topic of the command [default: the first Twist or TwistStamped]
     #[arg(long, value_name = "TOPIC")]
     action: Option<String>,
-    /// The topic of the odometry [default: the first Odometry or `JointState`]
+    /// The topic of the odometry [default: the first Odometry or JointState]
     #[arg(long, value_name = "TOPIC")]
     state: Option<String>,
     /// What the names of the published topics begin with

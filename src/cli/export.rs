@@ -42,7 +42,7 @@ pub(super) struct ExportArgs {
     /// With --to lerobot: store the frames as H.264 videos (needs ffmpeg; without masks) instead of PNG images
     #[arg(long)]
     videos: bool,
-    /// With --to lerobot: the robot, as `LeRobot` names it [default: turtlebot for simulated data, else unknown]
+    /// With --to lerobot: the robot, as LeRobot names it [default: turtlebot for simulated data, else unknown]
     #[arg(long, value_name = "NAME")]
     robot_type: Option<String>,
     /// The episode's number, counted from 0 [default: 0; with --to mcap, all]

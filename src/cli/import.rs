@@ -22,7 +22,7 @@ const PRESET: &str = "recording";
 /// Turn a recording into a data set.
 ///
 /// SOURCE is a folder of PNG or JPEG images (with or without a CSV file of times, actions and states), a Donkeycar tub, a
-/// `LeRobot` data set, a bag of ROS 2 (.mcap, .db3, or the directory of rosbag2), `NumPy` arrays (.npy, .npz), a video
+/// LeRobot data set, a bag of ROS 2 (.mcap, .db3, or the directory of rosbag2), NumPy arrays (.npy, .npz), a video
 /// (needs ffmpeg), or an archive of one of these (.zip, .tar, .tar.gz). Images become gray and get one size. Gaps in time split episodes. If you stop it, run the same command again:
 /// it continues.
 #[derive(clap::Args)]

@@ -1,6 +1,6 @@
 // Dream: the camera is cut, and the model goes on from its own frames; beside it, what really happens.
 
-import { html, useEffect, useMemo, useState } from "./preact.js";
+import { html, useEffect, useLayoutEffect, useMemo, useState } from "./preact.js";
 import { encodeGif } from "./gif.js";
 import { Gray, mse } from "./gray.js";
 import { heldAction, isManual, Pad } from "./keys.js";
@@ -92,7 +92,8 @@ export function Dream({ robot }) {
   useEffect(() => {
     if (robot.status === "reconnecting") setDream(null);
   }, [robot.status]);
-  useEffect(() => {
+  // With the picture, not after it: the key works as soon as the button is seen.
+  useLayoutEffect(() => {
     const pressed = event => {
       if (event.key !== " " || event.target.closest?.("button, input, select, textarea") || why_not) return;
       event.preventDefault();
@@ -112,7 +113,7 @@ export function Dream({ robot }) {
       <div class="two">
         <${Picture} image=${last?.imagined ?? now?.frame} className=${last ? `dreaming is-${shade}` : ""} note=${note} dim=${robot.status === "reconnecting"}
           caption=${last ? "imagined: the model's own frames" : "the camera; not cut yet"} label=${last ? "the imagined frame" : "the camera"} />
-        <${Picture} image=${last ? last.real : now?.frame} caption=${robot.is_drivable ? "the true simulator" : "what was recorded"} label="what really happens"
+        <${Picture} image=${last ? last.real : now?.frame} caption=${robot.source_id.startsWith("set:") ? "what was recorded" : "the true simulator"} label="what really happens"
           note=${dream?.is_alone ? (robot.is_drivable ? "a new episode: no comparison" : "does not follow your keys") : note} />
       </div>
       <div>
@@ -123,13 +124,18 @@ export function Dream({ robot }) {
           <div class="bar" role="img" aria-label=${`novelty ${last?.novelty?.toFixed(2) ?? "unknown"}`}><span class=${shade} style=${{ width: `${100 * (last?.novelty ?? 0)}%` }} /></div>
           <p class="ends"><span>like the training data</span><span>unlike it</span></p></div>
         <p class="wrong" role="status">${last?.novelty > NOVEL ? "Unlike the training data: do not trust this." : ""}</p>
-        <${Pad} />
-        <p class="quiet">${dream ? "The model gets no camera frame, only your keys." : "Cut the camera: the model goes on from its own frames, under your keys."}</p>
+        ${takesActions(robot.model) && html`<${Pad} />`}
+        <p class="quiet">${whatItGets(robot.model, dream)}</p>
       </div>
     </div>
     <${Drift} dream=${dream} period_s=${robot.spec.frame_period_s} />
     <footer><${Copy} curl=${() => curl("POST", `/v1/models/${robot.model.name}/predict`, body(robot))} python=${() => requests("POST", `/v1/models/${robot.model.name}/predict`, body(robot))} /></footer>
   </section>`;
+}
+
+function whatItGets(model, dream) {
+  if (!takesActions(model)) return dream ? "The model gets no camera frame." : "Cut the camera: the model goes on from its own frames.";
+  return dream ? "The model gets no camera frame, only your keys." : "Cut the camera: the model goes on from its own frames, under your keys.";
 }
 
 const DRIFT_LINES = [{ label: "error", color: "--orange", width: 2 }];

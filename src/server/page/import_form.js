@@ -56,10 +56,6 @@ export function Import({ submit }) {
   return html`<form class=${`card drop ${is_over ? "over" : ""}`} ref=${form} onSubmit=${event => { event.preventDefault(); send({}); }}
       onDragOver=${over(true)} onDragLeave=${over(false)} onDrop=${event => { over(false)(event); take(event.dataTransfer.files); }}>
     <h3>Import a recording</h3>
-    <p class="files"><label>Drop a file here, or choose one <input type="file" onChange=${event => { take(event.target.files); event.target.value = ""; }} /></label></p>
-    ${share !== null && html`<div class="sending"><progress aria-label="progress of the upload" max="1" value=${share} /><span class="quiet">${share < 1 ? `uploaded ${(100 * share).toFixed(0)} %` : "the import begins…"}</span>
-      <button type="button" class="small" onClick=${() => running.current?.stop()}>Stop</button></div>`}
-    <p class="wrong" role="alert">${wrong}</p>
     <div class="form">
     <label>Name <input name="name" required pattern="[a-z0-9][a-z0-9\\-]*" placeholder="mycar" value=${name} onInput=${event => setName(event.target.value)} /></label>
     <label>Path in the import folder, or upload <input name="source" required placeholder="drive-1" value=${source} onInput=${event => setSource(event.target.value)} /></label>
@@ -67,5 +63,9 @@ export function Import({ submit }) {
     <label>Frames per second <input name="rate" type="number" step="any" min="0.01" placeholder="as recorded" /></label>
     <label>Actions <input name="action" placeholder="found by name" /></label>
     <label>States <input name="state" placeholder="found by name" /></label>
-    </div><div class="actions"><button class="main">Import</button></div></form>`;
+    </div><div class="actions"><button class="main">Import</button></div>
+    <p class="files"><label>Or drop a file here, or choose one: it is imported with these settings <input type="file" onChange=${event => { take(event.target.files); event.target.value = ""; }} /></label></p>
+    ${share !== null && html`<div class="sending"><progress aria-label="progress of the upload" max="1" value=${share} /><span class="quiet">${share < 1 ? `uploaded ${(100 * share).toFixed(0)} %` : "the import begins…"}</span>
+      <button type="button" class="small" onClick=${() => running.current?.stop()}>Stop</button></div>`}
+    <p class="wrong" role="alert">${wrong}</p></form>`;
 }

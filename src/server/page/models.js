@@ -52,7 +52,7 @@ function Skill({ skill, interval, baseline }) {
   if (skill === undefined) return html`<p class="quiet">skill not measured; evaluate it on a data set</p>`;
   const place = value => Math.max(0, Math.min(100, 100 * value));
   const words = `skill ${skill.toFixed(2)}${interval ? `, 95 % interval ${interval.map(value => value.toFixed(2)).join(" to ")}` : ""}`;
-  return html`<p title=${`1 − error / error of the strongest simple guess${baseline ? ` (${baseline})` : ""}, on test data`}>${words}</p>
+  return html`<p title=${`1 − error / error of the strongest baseline${baseline ? ` (${baseline})` : ""}, on test data`}>${words}</p>
     <div class="bar" role="img" aria-label=${words}><span class=${skill > 0 ? "good" : "bad"} style=${{ width: `${place(skill)}%` }} />
     ${interval && html`<em style=${{ left: `${place(interval[0])}%`, width: `${place(interval[1]) - place(interval[0])}%` }} />`}</div>`;
 }

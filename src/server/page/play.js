@@ -107,7 +107,8 @@ function Errors({ history }) {
   const data = useMemo(() => {
     const of = value => compared.map(moment => (value(moment) === undefined ? null : levels(value(moment))));
     return [compared.map(({ at_s }) => at_s - latest), of(({ band }) => band?.[0]), of(({ band }) => band?.[1]), of(({ expected }) => expected), of(({ error }) => error)];
-  }, [history.length, latest]);
+    // Once a second is enough for half a minute, and costs a fifth.
+  }, [Math.floor(latest), compared.length < 10 && compared.length]);
   return html`<div><h2>Error over the last 30 s</h2>
     <${Plot} label="expected and actual error of the last 30 seconds" data=${data} series=${ERROR_LINES} bands=${[[2, 1]]} height=${170} x="seconds" y="gray levels" range=${(_, low, high) => [0, Math.max(10, high * 1.1)]} />
     <p class="key"><i class="line orange" /> actual <i class="line dashed" /> expected, with its 90 % band</p></div>`;
@@ -117,6 +118,7 @@ function Driving({ robot }) {
   const now = robot.history.at(-1);
   const moves = takesActions(robot.model) && now?.action?.length
     ? robot.spec.actions.map(({ name, unit }, place) => `${name} ${now.action[place].toFixed(2)} ${unit}`).join(", ") : "";
+  if (!robot.source) return html`<div><h2>Drive</h2><p class="quiet">${noteOf(robot, now)}</p></div>`;
   if (!robot.is_drivable) {
     return html`<div><h2>Source</h2><p class="driver">${!robot.source_id.startsWith("set:") ? "A standing camera: there is nothing to drive." : "A recorded episode: its actions are recorded too."}</p>
       <p class="quiet">${moves}</p></div>`;

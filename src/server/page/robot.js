@@ -48,6 +48,12 @@ export class Robot {
     return this.history.slice(Math.max(begin, this.history.length - this.spec.context));
   }
 
+  // Whether the present episode is long enough for a prediction that has come true.
+  get is_warm() {
+    const begin = this.history.findLastIndex(({ begins }) => begins);
+    return this.history.length - Math.max(begin, 0) >= this.spec.context + this.spec.horizon;
+  }
+
   hold(is_held) {
     this.is_held = is_held;
     this.wake();
@@ -107,7 +113,8 @@ export class Robot {
     this.receive(Object.assign(moment, comparison), answer);
     this.now = next;
     this.tell();
-    const period_ms = (1000 * this.spec.frame_period_s) / this.speed;
+    // Until the first comparison of an episode, frames are taken as fast as they come: nobody wants to wait for them.
+    const period_ms = this.is_warm ? (1000 * this.spec.frame_period_s) / this.speed : 0;
     await pause(Math.max(0, period_ms - (performance.now() - started_ms)));
   }
 

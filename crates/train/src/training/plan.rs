@@ -69,6 +69,7 @@ impl<'a> TrainingPlan<'a> {
         }
         let frames = window_frames(&train, shape.context + shape.horizon);
         let spec = config.model_spec(dataset, &frames);
+        check_channels(dataset, &spec)?;
         check_actions(config, dataset, &spec)?;
         spec.validate()?;
         let augmentation = Augmentation::new(&config.data, dataset, &frames, config.seed)?;
@@ -154,6 +155,30 @@ impl<'a> TrainingPlan<'a> {
         }
         metrics
     }
+}
+
+/// Errors: `Config` if the model takes actions or states that the data set does not have.
+fn check_channels(dataset: &Dataset, spec: &ModelSpec) -> Result<(), TrainError> {
+    let (takes, has) = (
+        [spec.action_inputs().is_some(), spec.state_inputs().is_some()],
+        [!spec.actions.is_empty(), !spec.states.is_empty()],
+    );
+    let missing = ["actions", "states"].into_iter().zip(takes.into_iter().zip(has));
+    let Some((missing, _)) = missing.into_iter().find(|(_, (takes, has))| *takes && !has) else {
+        return Ok(());
+    };
+    let fitting = match has {
+        [true, true] => "state-action",
+        [true, false] => "action",
+        [false, true] => "state",
+        [false, false] => "none",
+    };
+    Err(TrainError::Config(format!(
+        "data set \"{}\" has no {missing}, but model.conditioning is {}; set model.conditioning to {fitting}, or use a preset that \
+         fits: recording takes actions only, static-flow neither",
+        dataset.info().name,
+        spec.conditioning
+    )))
 }
 
 /// Errors: `ConstantActions` if the model takes actions that never change, so that it could not learn what they do.

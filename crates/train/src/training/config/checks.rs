@@ -84,6 +84,12 @@ impl TrainConfig {
                 ));
             }
         }
+        if self.model.architecture == ArchitectureKind::Flow && self.pretrain.steps > 0 {
+            return refused(format!(
+                "pretrain.steps is {}; the flow network has no pre-training, so it must be 0",
+                self.pretrain.steps
+            ));
+        }
         if self.data.mirror == Mirror::Movers && self.model.conditioning != Conditioning::None {
             return refused(format!(
                 "data.mirror is \"movers\", which is for a camera that stands and takes no actions and no state; \
