@@ -196,7 +196,7 @@ impl FromStr for WeightedDataset {
                 weight,
             }),
             _ => Err(format!(
-                "\"{weight}\" is not a weight; write NAME=WEIGHT with a number above 0, as in rooms=0.3"
+                "\"{text}\" is no data set with a weight; write NAME=WEIGHT with a number above 0, as in rooms=0.3"
             )),
         }
     }

@@ -23,6 +23,8 @@ struct Entry<T> {
 
 /// All environments, by id.
 pub(super) struct Environments<T> {
+    /// What a caller calls one of them.
+    kind: &'static str,
     limit: usize,
     idle: Duration,
     /// How long an environment must have been idle to be replaced when the table is full.
@@ -31,8 +33,9 @@ pub(super) struct Environments<T> {
 }
 
 impl<T> Environments<T> {
-    pub(super) fn new(config: &ServerConfig) -> Self {
+    pub(super) fn new(kind: &'static str, config: &ServerConfig) -> Self {
         Self {
+            kind,
             limit: config.max_environments,
             idle: Duration::from_millis(config.environment_idle_ms),
             evict_after: Duration::from_millis(config.environment_evict_ms),
@@ -61,9 +64,9 @@ impl<T> Environments<T> {
         let idlest = table.iter().min_by_key(|(_, entry)| entry.used);
         let idlest = idlest.map(|(id, entry)| (id.clone(), now.saturating_duration_since(entry.used)));
         let (id, idle) = idlest.filter(|(_, idle)| *idle >= self.evict_after).ok_or_else(|| {
-            let limit = self.limit;
+            let (limit, kind) = (self.limit, self.kind);
             ApiError::unavailable(format!(
-                "{limit} environments are in use already; delete one, or try again later"
+                "{limit} {kind}s are in use already (setting max_environments); end one, or try again later"
             ))
         })?;
         table.remove(&id);
@@ -80,6 +83,14 @@ impl<T> Environments<T> {
         Ok(Arc::clone(&entry.environment))
     }
 
+    /// A new one may replace it at once, as one that was idle for long enough.
+    pub(super) fn give_up_place(&self, id: &str, now: Instant) {
+        let mut table = self.table(now);
+        if let (Some(entry), Some(earlier)) = (table.get_mut(id), now.checked_sub(self.evict_after)) {
+            entry.used = earlier;
+        }
+    }
+
     /// Errors: `NotFound`, also if it is another caller's.
     pub(super) fn remove(&self, id: &str, caller: Caller, now: Instant) -> Result<(), ApiError> {
         self.get(id, caller, now)?;
@@ -89,7 +100,8 @@ impl<T> Environments<T> {
 
     fn unknown(&self, id: &str) -> ApiError {
         ApiError::NotFound(format!(
-            "there is no environment \"{}\"; one that nobody steps for {} s is dropped",
+            "there is no {} \"{}\"; one that nobody steps for {} s is dropped",
+            self.kind,
             id.escape_default(),
             self.idle.as_secs()
         ))
@@ -113,10 +125,11 @@ mod tests {
     }
 
     fn table(limit: usize) -> Environments<Mutex<Environment>> {
-        Environments::new(&ServerConfig {
+        let config = ServerConfig {
             max_environments: limit,
             ..ServerConfig::default()
-        })
+        };
+        Environments::new("environment", &config)
     }
 
     #[test]
@@ -145,6 +158,16 @@ mod tests {
             .add(environment(), Caller::default(), start + Duration::from_secs(2))
             .unwrap_err();
         assert!(matches!(error, ApiError::Unavailable { .. }));
+    }
+
+    #[test]
+    fn one_that_gave_up_its_place_is_replaced_at_once() {
+        let (table, start) = (table(1), Instant::now() + Duration::from_mins(1));
+        let first = table.add(environment(), Caller::default(), start).unwrap();
+        table.give_up_place(&first, start);
+        assert!(table.get(&first, Caller::default(), start).is_ok());
+        table.give_up_place(&first, start);
+        assert!(table.add(environment(), Caller::default(), start).is_ok());
     }
 
     #[test]

@@ -20,6 +20,8 @@ use foreframe_jobs::store::{Objects, StoreError};
 
 /// Bytes that are written at once.
 const PIECE_BYTES: usize = 1 << 20;
+/// How long nothing may arrive of a file that is being received until it counts as left by a server that was killed.
+const MAX_PAUSE: Duration = Duration::from_mins(5);
 /// Import jobs in which an upload is looked for, the newest.
 const MAX_IMPORTS: usize = 1000;
 
@@ -130,8 +132,7 @@ impl Uploads {
         })
     }
 
-    /// Deletes the uploads whose import has succeeded or failed, and those that no import has used for too long. Errors: those of
-    /// the jobs.
+    /// Deletes the uploads whose import has succeeded, and those that no import has used for too long. Errors: those of the jobs.
     pub(super) async fn sweep(&self, jobs: &Jobs, objects: &Objects) -> Result<(), JobError> {
         let dir = self.dir.clone();
         let found = tokio::task::spawn_blocking(move || names(&dir)).await;
@@ -163,11 +164,14 @@ impl Uploads {
         let id = format!(":{name}/");
         let uses = |job: &&Job| matches!(&job.spec, JobSpec::Import(spec) if spec.source.contains(&id));
         let newest = imports.iter().find(uses).map(|job| job.state);
+        let dir = self.dir.join(name);
+        let is_older = |limit| age(&dir).is_some_and(|age| age > limit);
         match newest {
-            Some(JobState::Succeeded | JobState::Failed) => true,
+            Some(JobState::Succeeded) => true,
             Some(JobState::Queued | JobState::Running) => false,
-            // It may still be imported, or resumed.
-            Some(JobState::Cancelled) | None => age(&self.dir.join(name)).is_some_and(|age| age > self.keep),
+            // It may still be imported with other options, or resumed.
+            None if is_unfinished(&dir) => is_older(self.keep.min(MAX_PAUSE)),
+            Some(JobState::Failed | JobState::Cancelled) | None => is_older(self.keep),
         }
     }
 }
@@ -213,6 +217,12 @@ fn names(dir: &Path) -> io::Result<Vec<String>> {
     let entries = none_if_missing(fs::read_dir(dir))?.into_iter().flatten();
     let names = entries.map(|entry| Ok(entry?.file_name().to_string_lossy().into_owned()));
     names.collect()
+}
+
+/// Whether a directory holds only a file that is being received, or was when the server was killed.
+fn is_unfinished(dir: &Path) -> bool {
+    let is_partial = |entry: fs::DirEntry| entry.file_name().to_string_lossy().ends_with(".partial");
+    fs::read_dir(dir).is_ok_and(|entries| entries.flatten().all(is_partial))
 }
 
 /// How long ago anything in a directory was written.

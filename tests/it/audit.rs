@@ -24,7 +24,7 @@ const AUDITED: [&str; 6] = [
     "DELETE /v1/datasets/{dataset}",
 ];
 /// The operations that change nothing that lasts.
-const NOT_AUDITED: [&str; 11] = [
+const NOT_AUDITED: [&str; 15] = [
     "POST /v1/models/{model}/predict",
     "POST /v1/models/{model}/rollouts",
     "POST /v1/sessions",
@@ -33,6 +33,10 @@ const NOT_AUDITED: [&str; 11] = [
     "POST /v1/jobs/estimate",
     // Kept only until its import has ended.
     "POST /v1/uploads",
+    "POST /v1/realtime/sessions",
+    "POST /v1/realtime/sessions/{id}/step",
+    "POST /v1/realtime/sessions/{id}/reset",
+    "POST /v1/realtime/sessions/{id}/close",
     "POST /v1/environments",
     "POST /v1/environments/{id}/reset",
     "POST /v1/environments/{id}/step",

@@ -64,9 +64,9 @@ mod nn_model;
 mod nn_optimizer;
 mod nn_reference;
 mod nn_spec;
-#[cfg(feature = "otlp")]
 mod openenv;
 mod openpi;
+#[cfg(feature = "otlp")]
 mod otlp;
 mod overload;
 #[cfg(unix)]

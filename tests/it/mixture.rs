@@ -90,7 +90,7 @@ fn data_sets_that_do_not_fit_are_refused() {
         "{error}"
     );
     let error = refused(moving_squares(3, 12, 0.2), 1.0);
-    assert!(error.contains("named twice"), "{error}");
+    assert!(error.contains("have the same content"), "{error}");
     let error = refused(part("light", 3, |_| {}), 0.0);
     assert!(error.contains("must be above 0"), "{error}");
     assert!(Dataset::join(Vec::new()).is_err());

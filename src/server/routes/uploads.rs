@@ -45,13 +45,14 @@ struct Upload {
 }
 
 /// Uploads a recording for an import job: an archive (.zip, .tar, .tar.gz) of a folder, or a single file. The body is the file. It
-/// is deleted when its import has succeeded or failed, or if none begins within `upload_idle_ms`.
+/// is deleted when its import has succeeded, or if none begins within `upload_idle_ms`.
 #[utoipa::path(
     post, path = "/v1/uploads", params(UploadQuery),
     request_body(content = UploadedBytes, content_type = "application/octet-stream", description = "The file"),
     responses(
         (status = 201, description = "Received", body = Upload),
         (status = 413, description = "The file exceeds `max_upload_mib`"),
+        (status = 415, description = "A form instead of the file"),
         (status = 422, description = "A name of no kind that can be imported, or an empty file"),
         (status = 503, description = "Too many uploads wait for their imports"),
     )
@@ -67,6 +68,11 @@ async fn create(
         .get(header::CONTENT_LENGTH)
         .and_then(|length| length.to_str().ok()?.parse().ok());
     app.uploads.check_length(stated)?;
+    let is_form = |kind: &axum::http::HeaderValue| kind.as_bytes().starts_with(b"multipart/");
+    if headers.get(header::CONTENT_TYPE).is_some_and(is_form) {
+        let right = "the body is the file itself, without a form; send it with curl --data-binary @FILE";
+        return Err(ApiError::UnsupportedMedia(right.to_owned()));
+    }
     let bytes = app.uploads.receive(&file, body, &app.blocking).await?;
     file.push(app.store().objects()).await.map_err(JobError::Store)?;
     let source = file.to_string();

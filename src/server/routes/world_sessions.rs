@@ -181,6 +181,7 @@ async fn reset(app: App, caller: Caller, Path(id): Path<String>) -> Result<axum:
 async fn close(app: App, caller: Caller, Path(id): Path<String>) -> Result<axum::Json<ClosedSession>, ApiError> {
     let session = app.world_sessions.get(&id, caller, Instant::now())?;
     session.lock().await.is_closed = true;
+    app.world_sessions.give_up_place(&id, Instant::now());
     Ok(axum::Json(ClosedSession {
         session_id: id,
         closed: true,

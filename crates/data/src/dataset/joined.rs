@@ -92,9 +92,10 @@ fn check_weights(weighted: &[(Dataset, f64)]) -> Result<(), DatasetError> {
             )));
         }
         let is_same = |(other, _): &(Dataset, f64)| other.info.content_hash == dataset.info.content_hash;
-        if weighted[..place].iter().any(is_same) {
+        if let Some((other, _)) = weighted[..place].iter().find(|other| is_same(other)) {
             return Err(DatasetError::Usage(format!(
-                "the data set \"{name}\" is named twice; name it once, with a larger weight"
+                "the data sets \"{}\" and \"{name}\" have the same content; name one of them, with a larger weight",
+                other.info.name
             )));
         }
     }

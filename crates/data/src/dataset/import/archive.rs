@@ -37,7 +37,7 @@ fn packing(path: &Path) -> Option<(Packing, &str)> {
     let name = path.file_name()?.to_str()?;
     ENDINGS.into_iter().find_map(|(ending, packing)| {
         let (stem, end) = name.split_at_checked(name.len().checked_sub(ending.len())?)?;
-        (!stem.is_empty() && end.eq_ignore_ascii_case(ending)).then_some((packing, stem))
+        (!stem.chars().all(|letter| letter == '.') && end.eq_ignore_ascii_case(ending)).then_some((packing, stem))
     })
 }
 
@@ -106,6 +106,7 @@ mod tests {
             ("walk.tgz", Some((Packing::TarGz, "walk"))),
             ("walk.tar", Some((Packing::Tar, "walk"))),
             (".zip", None),
+            ("...zip", None),
             ("walk.gz", None),
             ("ü", None),
         ] {

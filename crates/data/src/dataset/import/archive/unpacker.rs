@@ -14,6 +14,8 @@ const PIECE_BYTES: usize = 1 << 18;
 /// The longest path in an archive, in bytes, and the most folders in it: each can make a folder on the disk.
 const MAX_PATH_BYTES: usize = 1024;
 const MAX_PATH_PARTS: usize = 32;
+/// The most folders: a recording has few, and to delete very many takes long.
+const MAX_FOLDERS: u64 = 20_000;
 /// What some systems add to every archive beside the files of its maker.
 const FOREIGN: [&str; 2] = ["__MACOSX", ".DS_Store"];
 const FOREIGN_PREFIX: &str = "._";
@@ -24,6 +26,7 @@ pub(super) struct Unpacker<'a> {
     max_files: u64,
     max_mib: u64,
     files: u64,
+    folders: u64,
     bytes: u64,
     cancelled: &'a AtomicBool,
 }
@@ -42,6 +45,7 @@ impl<'a> Unpacker<'a> {
             max_files: config.max_files,
             max_mib: config.disk_mib,
             files: 0,
+            folders: 0,
             bytes: 0,
             cancelled,
         })
@@ -68,9 +72,37 @@ impl<'a> Unpacker<'a> {
     /// Makes a folder. Errors: `Archive`, `Io`.
     pub(super) fn folder(&mut self, name: &str) -> Result<(), ImportError> {
         match self.path(name)? {
-            Some(path) => fs::create_dir_all(&path).map_err(|error| self.not_made(name, &path, error)),
+            Some(path) => self.make_folders(name, &path),
             None => Ok(()),
         }
+    }
+
+    /// Makes a folder with those above it. Errors: `Archive`, `Io`, `Stopped`.
+    fn make_folders(&mut self, name: &str, path: &Path) -> Result<(), ImportError> {
+        if path.is_dir() {
+            return Ok(());
+        }
+        if let Some(above) = path.parent() {
+            self.make_folders(name, above)?;
+        }
+        self.folders += 1;
+        if self.folders > MAX_FOLDERS {
+            return Err(self.wrong(
+                "",
+                format!("holds more than {MAX_FOLDERS} folders; import the folder itself"),
+            ));
+        }
+        fs::create_dir(path).map_err(|error| self.not_made(name, path, error))
+    }
+
+    /// Errors: `Archive` if it holds more entries than files are allowed.
+    pub(super) fn check_count(&self, entries: u64) -> Result<(), ImportError> {
+        if entries <= self.max_files {
+            return Ok(());
+        }
+        let (limit, right) = (self.max_files, "raise it, or import the folder itself");
+        let reason = format!("holds more than {limit} files, the limit of the setting max_import_files; {right}");
+        Err(self.wrong("", reason))
     }
 
     /// Counts an entry or header of the archive. Errors: `Archive`, `Stopped`.
@@ -79,12 +111,7 @@ impl<'a> Unpacker<'a> {
             return Err(ImportError::Stopped);
         }
         self.files += 1;
-        if self.files <= self.max_files {
-            return Ok(());
-        }
-        let (limit, right) = (self.max_files, "raise it, or import the folder itself");
-        let reason = format!("holds more than {limit} files, the limit of the setting max_import_files; {right}");
-        Err(self.wrong("", reason))
+        self.check_count(self.files)
     }
 
     /// Writes a file. Errors: `Archive`, `Io`, `Stopped`.
@@ -115,10 +142,9 @@ impl<'a> Unpacker<'a> {
         }
     }
 
-    fn create(&self, name: &str, path: &Path) -> Result<File, ImportError> {
-        let folders = fs::create_dir_all(path.parent().unwrap_or(self.folder));
-        let created = folders.and_then(|()| File::create_new(path));
-        created.map_err(|error| self.not_made(name, path, error))
+    fn create(&mut self, name: &str, path: &Path) -> Result<File, ImportError> {
+        self.make_folders(name, path.parent().unwrap_or(self.folder))?;
+        File::create_new(path).map_err(|error| self.not_made(name, path, error))
     }
 
     /// Where an entry is to be written; `None` for what does not belong to the recording. Errors: `Archive`.

@@ -1,0 +1,136 @@
+//! The specification of a training.
+
+use std::collections::BTreeMap;
+use std::iter;
+
+use serde::{Deserialize, Serialize};
+
+use super::{check_dataset, check_known, dataset, name};
+use crate::jobs::JobError;
+use crate::store::JobId;
+use foreframe_core::error_text;
+use foreframe_core::types::{DatasetName, ModelName};
+use foreframe_train::training::{TrainConfig, TrainError};
+
+/// A training: publishes the next version of the model `name`. A cancelled training resumes from its checkpoint.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct TrainSpec {
+    /// The model's name: a to z, 0 to 9 and `-`, at most 64 characters.
+    #[serde(deserialize_with = "name")]
+    #[schema(value_type = String, pattern = "^[a-z0-9][a-z0-9-]{0,63}$")]
+    pub name: ModelName,
+    /// The preset of its settings.
+    #[schema(schema_with = preset_schema)]
+    pub preset: String,
+    /// Name of a data set in the data directory.
+    #[serde(deserialize_with = "dataset")]
+    #[schema(value_type = String)]
+    pub dataset: DatasetName,
+    /// Further data sets to train on, each with a weight above 0: how many windows it gives for one of `dataset`. Frame size,
+    /// frame period and channels must be those of `dataset`.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    #[schema(value_type = BTreeMap<String, f64>)]
+    pub mixture: BTreeMap<DatasetName, f64>,
+    /// Settings that replace those of the preset.
+    #[serde(default, skip_serializing_if = "serde_json::Map::is_empty")]
+    #[schema(value_type = Object)]
+    pub settings: serde_json::Map<String, serde_json::Value>,
+    /// Waits until the job with this id has ended, and fails if that has failed. The data set or model that it makes need not
+    /// exist yet.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schema(value_type = Option<String>, pattern = "^job-[0-9]{1,18}$")]
+    pub after: Option<JobId>,
+}
+
+/// The names of all presets.
+fn preset_schema() -> utoipa::openapi::Object {
+    utoipa::openapi::ObjectBuilder::new()
+        .schema_type(utoipa::openapi::Type::String)
+        .description(Some("The preset of its settings."))
+        .enum_values(Some(TrainConfig::preset_names()))
+        .build()
+}
+
+impl TrainSpec {
+    pub(super) fn check(&self, datasets: &[DatasetName]) -> Result<(), JobError> {
+        self.config()?;
+        check_dataset(&self.dataset, datasets)?;
+        for (name, weight) in &self.mixture {
+            check_known(("mixture", "data set"), name, datasets.iter())?;
+            if !(weight.is_finite() && *weight > 0.0) {
+                let reason = format!("the weight of \"{name}\" is {weight}; it must be above 0");
+                return Err(JobError::invalid("mixture", reason));
+            }
+            if *name == self.dataset {
+                let reason = format!("\"{name}\" is the data set itself, which has the weight 1");
+                return Err(JobError::invalid("mixture", reason));
+            }
+        }
+        Ok(())
+    }
+
+    /// All data sets with their weights.
+    pub(in crate::jobs) fn datasets(&self) -> impl Iterator<Item = (&DatasetName, f64)> {
+        iter::once((&self.dataset, 1.0)).chain(self.mixture.iter().map(|(name, weight)| (name, *weight)))
+    }
+
+    /// The preset with the job's settings. Errors: `Invalid`, which names the presets or the setting.
+    pub(in crate::jobs) fn config(&self) -> Result<TrainConfig, JobError> {
+        let text = toml::to_string(&self.settings).map_err(|error| {
+            let reason = format!("{error}; a setting is a number, a string, true or false, not null");
+            JobError::invalid("settings", reason)
+        })?;
+        let layered = TrainConfig::layered(&self.preset, Some(&text), &[]);
+        let config = layered.map_err(|error| match error {
+            TrainError::UnknownPreset { .. } => JobError::invalid("preset", error.to_string()),
+            other => JobError::invalid("settings", error_text::with_causes(&other)),
+        })?;
+        Ok(TrainConfig {
+            name: self.name.clone(),
+            ..config
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_unknown_preset_is_refused_with_the_available_ones() {
+        let spec = TrainSpec {
+            name: "a".parse().unwrap(),
+            preset: "papr".to_owned(),
+            dataset: "d".parse().unwrap(),
+            mixture: BTreeMap::new(),
+            settings: serde_json::Map::new(),
+            after: None,
+        };
+        let error = spec.check(&[]).unwrap_err().to_string();
+        assert!(error.starts_with("preset: ") && error.contains("moving"), "{error}");
+    }
+
+    #[test]
+    fn a_mixture_names_other_data_sets_with_weights_above_0() {
+        let known: Vec<DatasetName> = ["a", "b"].map(|name| name.parse().unwrap()).into();
+        let check = |mixture: &[(&str, f64)]| {
+            let spec = TrainSpec {
+                name: "m".parse().unwrap(),
+                preset: "paper".to_owned(),
+                dataset: "a".parse().unwrap(),
+                mixture: mixture
+                    .iter()
+                    .map(|&(name, weight)| (name.parse().unwrap(), weight))
+                    .collect(),
+                settings: serde_json::Map::new(),
+                after: None,
+            };
+            spec.check(&known).map_err(|error| error.to_string())
+        };
+        assert_eq!(check(&[("b", 0.3)]), Ok(()));
+        assert!(check(&[("b", 0.0)]).unwrap_err().contains("the weight of \"b\" is 0"));
+        assert!(check(&[("a", 1.0)]).unwrap_err().contains("is the data set itself"));
+        assert!(check(&[("c", 1.0)]).unwrap_err().starts_with("mixture: "));
+    }
+}
