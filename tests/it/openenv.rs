@@ -112,7 +112,7 @@ async fn a_bad_message_is_refused_with_a_code_and_changes_nothing() {
     for (message, expected, contained) in [
         ("{", "INVALID_JSON", "EOF"),
         ("", "INVALID_JSON", "EOF"),
-        ("[]", "VALIDATION_ERROR", "type"),
+        ("[]", "VALIDATION_ERROR", "invalid length"),
         ("{}", "VALIDATION_ERROR", "type"),
         (r#"{"type":"jump"}"#, "UNKNOWN_TYPE", "must be reset"),
         (r#"{"type":"step"}"#, "VALIDATION_ERROR", "action is missing"),

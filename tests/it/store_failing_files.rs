@@ -11,7 +11,7 @@ use serde_json::{Value, json};
 
 use crate::jobs_killed::{copy_dataset, weights};
 use crate::jobs_outage::{training, undisturbed};
-use crate::process::{RunningServer, foreframe, text};
+use crate::process::{RunningServer, foreframe, output, text};
 use crate::recordings;
 use crate::service::{context, model, spec};
 use crate::store_away::{status, wait_for_status};
@@ -165,6 +165,12 @@ fn a_database_that_cannot_be_written_is_refused_at_once() {
         command.env("FAILING_DIR", database).env("FAILING_SWITCH", switch);
         command.output().unwrap()
     };
+    // A list alone makes no database.
+    let made = output(
+        dir.path(),
+        &["keys", "create", "robot", "--data-dir", data.to_str().unwrap()],
+    );
+    assert!(made.status.success(), "{}", text(&made.stderr));
     assert!(list(Path::new("/nowhere")).status.success());
     let started = Instant::now();
     let refused = list(&data.join("foreframe.db"));
