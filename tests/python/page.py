@@ -274,6 +274,7 @@ def a_dropped_file_is_imported(browser, server):
 def a_training_is_watched(browser, server):
     page = browser.open("train")
     page.get_by_label("Preset").locator("option[value=paper]").wait_for(state="attached")
+    page.get_by_label("Data set").first.select_option("room")
     page.get_by_label("Preset").select_option("static")
     page.get_by_label("Name of the model").fill("tiny")
     page.get_by_label("Steps").fill("40")
