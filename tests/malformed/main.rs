@@ -24,7 +24,6 @@ mod service;
 mod test_service;
 
 use std::sync::{Mutex, MutexGuard, PoisonError};
-use std::time::Duration;
 
 use peak_alloc::PeakAlloc;
 
@@ -34,19 +33,8 @@ static ALLOCATOR: PeakAlloc = PeakAlloc;
 /// Memory is counted for the whole process, so one test runs at a time.
 static EXCLUSIVE: Mutex<()> = Mutex::new(());
 
-/// The turn of a test, when what the one before left to other threads is done.
 fn exclusive() -> MutexGuard<'static, ()> {
-    let turn = EXCLUSIVE.lock().unwrap_or_else(PoisonError::into_inner);
-    let mut before = ALLOCATOR.current_usage();
-    for _ in 0..100 {
-        std::thread::sleep(Duration::from_millis(20));
-        let now = ALLOCATOR.current_usage();
-        if now == before {
-            break;
-        }
-        before = now;
-    }
-    turn
+    EXCLUSIVE.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// Runs `work`, which may allocate at most `limit_bytes` beyond what is already allocated.
