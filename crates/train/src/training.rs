@@ -147,7 +147,11 @@ pub fn run(
         return interrupted(TrainingStage::Sequence, state.progress.step);
     }
     state.restore_best()?;
-    let validation = objective.validation_by_part(&state.parameters)?;
+    // Of a single data set, it is known already.
+    let validation = match plan.mixture.len() {
+        1 => Vec::new(),
+        _ => objective.validation_by_part(&state.parameters)?,
+    };
     let manifest = plan.manifest(training, &state, &validation)?;
     let history = serde_json::to_vec(&state.progress.history);
     let history =

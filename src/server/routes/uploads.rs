@@ -45,7 +45,7 @@ struct Upload {
 }
 
 /// Uploads a recording for an import job: an archive (.zip, .tar, .tar.gz) of a folder, or a single file. The body is the file. It
-/// is deleted when its import has succeeded, or if none begins within `upload_idle_ms`.
+/// is deleted when its import has succeeded, otherwise after `upload_idle_ms`.
 #[utoipa::path(
     post, path = "/v1/uploads", params(UploadQuery),
     request_body(content = UploadedBytes, content_type = "application/octet-stream", description = "The file"),

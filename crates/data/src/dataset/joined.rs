@@ -15,14 +15,10 @@ impl Dataset {
     /// and channels are those of the first. The channels of the others are found by name and unit; those that the first does
     /// not have are left out, and so are masks. One data set stays as it is. Errors: `Usage` if there is none, a weight is not
     /// above 0, a data set occurs twice, or sizes, periods or channels do not fit.
-    pub fn join(weighted: Vec<(Self, f64)>) -> Result<Self, DatasetError> {
+    pub fn join(mut weighted: Vec<(Self, f64)>) -> Result<Self, DatasetError> {
         check_weights(&weighted)?;
         if weighted.len() == 1 {
-            return Ok(weighted
-                .into_iter()
-                .map(|(dataset, _)| dataset)
-                .collect::<Vec<_>>()
-                .remove(0));
+            return Ok(weighted.swap_remove(0).0);
         }
         let first = weighted
             .first()

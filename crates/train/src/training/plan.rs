@@ -81,7 +81,7 @@ impl<'a> TrainingPlan<'a> {
         })
     }
 
-    /// The manifest of the trained model. `validation` is the error of each part of the data set.
+    /// The manifest of the trained model. `validation` is the error of each part of a joined data set.
     pub(super) fn manifest(
         &self,
         training: &Training<'_>,
