@@ -85,7 +85,7 @@ refused(session, 5, 400, "invalid_request", "takes 64×64", images={"front": [[0
 refused(session, 5, 400, "invalid_request", "whole number", images={"front": [[0.5]]})
 refused(session, 5, 400, "invalid_request", "one image", images={})
 refused(session, 5, 400, "invalid_request", "action", action=[1.0])
-refused("nothing", 0, 404, "session_not_found", "there is no environment")
+refused("nothing", 0, 404, "session_not_found", "there is no session")
 assert client.post(f"{SESSIONS}/{session}/step", json={"step_id": 5}).status_code == 422
 assert client.post(SESSIONS, json={"model": "nothing"}).status_code == 404
 assert client.post(SESSIONS, json={"model": "moving-flow", "mode": "policy_inference"}).status_code == 422
