@@ -178,6 +178,15 @@ fn print_summary(report: &EvaluationReport, out: &Path, has_page: bool) -> Resul
     for (set, verdict) in verdicts(report) {
         print_line(format!("{set}: {verdict}"))?;
     }
+    for set in &report.sets {
+        let scores = set.outcome.scores().and_then(|scores| scores.uncertainty.as_ref());
+        if let Some(auroc) = scores.and_then(|scores| scores.wrong_origin_auroc) {
+            print_line(format!(
+                "{}: novelty of poses counted from the trial's start: AUROC {auroc:.3}",
+                set.split
+            ))?;
+        }
+    }
     for other in &report.novelty {
         print_line(format!("novelty of {}: AUROC {:.3}", other.dataset, other.auroc))?;
     }

@@ -227,7 +227,7 @@ fn strange_frames_get_a_warning_and_no_band() {
     let first_error = lines.iter().position(|line| line.starts_with("t+")).unwrap();
     let warning = lines[..first_error]
         .iter()
-        .any(|line| line.starts_with("warning: novelty 1.00: these frames are unlike"));
+        .any(|line| line.starts_with("warning: novelty 1.00: the frames, the state or the actions are unlike"));
     assert!(warning && !printed.contains("90 % between"), "{printed}");
     // Two true frames follow.
     assert_eq!(printed.matches(": actual MSE ").count(), 2, "{printed}");

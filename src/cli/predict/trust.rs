@@ -39,8 +39,9 @@ fn novelty_line(novelty: f32) -> String {
         );
     }
     format!(
-        "warning: novelty {novelty:.2}: these frames are unlike the training data ({percent:.0} % of the validation contexts are \
-         more like it), so no expected errors are given; train a model on frames of this camera"
+        "warning: novelty {novelty:.2}: the frames, the state or the actions are unlike the training data ({percent:.0} % of the \
+         validation contexts are more like it), so no expected errors are given; check the state's origin and units, or train a \
+         model on frames of this camera"
     )
 }
 

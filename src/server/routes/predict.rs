@@ -85,8 +85,8 @@ struct PredictResponse {
     /// The 90 % band of each of these errors: 5 % of the errors are below it, 5 % above; absent if the model is not calibrated.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     mse_band_90: Vec<[f32; 2]>,
-    /// How unlike the training data the context is, 0…1: the share of validation contexts that are nearer to it; absent if the
-    /// model is not calibrated.
+    /// How unlike the training data frames, state and actions are, 0…1: the share of validation contexts that are nearer to it;
+    /// absent if the model is not calibrated.
     #[serde(skip_serializing_if = "Option::is_none")]
     novelty: Option<f32>,
     /// For each frame, whether it is beyond what the model was trained for; absent if none is.

@@ -87,7 +87,7 @@ struct RolloutResponse {
     /// The 90 % band of each of these errors; absent if the model is not calibrated.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     mse_band_90: Vec<Vec<[f32; 2]>>,
-    /// How unlike the training data the context is, 0…1; absent if the model is not calibrated.
+    /// How unlike the training data frames, state and the most usual plan are, 0…1; absent if the model is not calibrated.
     #[serde(skip_serializing_if = "Option::is_none")]
     novelty: Option<f32>,
     /// For each step, whether it is beyond what the model was trained for; absent if none is.
@@ -252,7 +252,7 @@ fn answer(
                 version: manifest.version,
                 expected_mse: calibrated().map(Rollout::expected_mse).collect(),
                 mse_band_90: calibrated().map(Rollout::mse_bands).collect(),
-                novelty: rollouts.first().and_then(|rollout| rollout.novelty),
+                novelty: rollouts.iter().filter_map(|rollout| rollout.novelty).reduce(f32::min),
                 rollouts: rollouts
                     .into_iter()
                     .map(|rollout| images::encode_owned(rollout.frames, format))

@@ -2,10 +2,12 @@
 //! is, and the ranges of actions and states in training. All of it is stored in the manifest and is computed from numbers
 //! that are known when a prediction is made. `evaluation::calibrate` fits it on the validation split.
 
+mod at_pose;
 mod context;
 
 use serde::{Deserialize, Serialize};
 
+pub use self::at_pose::{LookAtPose, POSE_FEATURES, pose_features};
 pub use self::context::{APPEARANCE, ContextStatistics};
 use crate::frame::Frame;
 use crate::frame::preprocess::scale;
@@ -15,6 +17,8 @@ use crate::nn::ModelSpec;
 pub const ERROR_INPUTS: usize = 8;
 /// Added to mean squared differences before their logarithm.
 const FLOOR: f64 = 1e-6;
+/// The distance of a value that is out of its range in training by the width of this range.
+const OUT_OF_RANGE: f64 = 10.0;
 
 /// What a model's validation says about its predictions.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -57,12 +61,17 @@ impl Calibration {
             step.weights.len() == ERROR_INPUTS && step.mean_factor > 0.0 && is_band
         };
         let mut ranges = self.actions.iter().chain(&self.states);
+        let is_valid_at_pose = novelty.at_pose.as_ref().is_none_or(LookAtPose::is_valid);
         let rules = [
             (
                 self.steps.iter().all(factors),
                 "steps: each step needs eight weights, a mean_factor above 0, and a low_factor of at most the high_factor",
             ),
             (square, "novelty.whitening: it must have a row for each statistic"),
+            (
+                is_valid_at_pose,
+                "novelty.at_pose: weights and whitening must have a row for each statistic, and scale must be above 0",
+            ),
             (
                 novelty.appearance_scale > 0.0 && novelty.still_scale > 0.0,
                 "novelty: appearance_scale and still_scale must be above 0",
@@ -79,6 +88,28 @@ impl Calibration {
         let broken = rules.iter().find(|(holds, _)| !holds);
         broken.map_or(Ok(()), |(_, rule)| Err(format!("calibration.{rule}")))
     }
+
+    /// How far what a prediction is made from is from the training data: the frames, whether they fit the state's pose, and
+    /// values of the state and of the actions (step by step) out of their ranges. 5 % of the training contexts have about 1 or
+    /// more. A state that is not known says nothing.
+    #[must_use]
+    pub fn distance(
+        &self,
+        spec: &ModelSpec,
+        context: &ContextStatistics,
+        state: Option<&[f32]>,
+        actions: &[f32],
+    ) -> f64 {
+        let features = state.and_then(|state| pose_features(spec, state));
+        let at_pose = self.novelty.at_pose.as_ref().zip(features);
+        let at_pose = at_pose.map_or(0.0, |(look, features)| look.distance(context, &features));
+        let read = spec.states_read_by_layers().into_iter();
+        let of_state = read.filter_map(|channel| Some((self.states.get(channel)?, *state?.get(channel)?)));
+        let of_actions = self.actions.iter().cycle().zip(actions.iter().copied());
+        let excess = of_state.chain(of_actions).map(|(range, value)| range.excess(value));
+        let out_of_range = OUT_OF_RANGE * excess.fold(0.0, f64::max);
+        self.novelty.distance(context).max(at_pose).max(out_of_range)
+    }
 }
 
 /// The smallest and the largest value in training.
@@ -89,6 +120,14 @@ pub struct ValueRange {
     pub min: f32,
     /// Largest.
     pub max: f32,
+}
+
+impl ValueRange {
+    /// How far a value is out of the range, over the range's width; 0 inside.
+    fn excess(self, value: f32) -> f64 {
+        let out = f64::from((self.min - value).max(value - self.max).max(0.0));
+        out / f64::from(self.max - self.min).max(FLOOR)
+    }
 }
 
 /// The error of one step: median = exp(intercept + Σ weights · inputs), times a factor.
@@ -134,8 +173,9 @@ pub struct ExpectedError {
     pub high: f32,
 }
 
-/// Measures how unlike the training data a context is: by the look of its last frame, and by how much of the picture stands
-/// still. The distance is the larger of both, each over its 95 % quantile in training.
+/// Measures how unlike the training data a context is: by the look of its last frame, by how much of the picture stands still,
+/// and for models of one room by the look that the pose lets expect. The distance is the largest of them, each over its 95 %
+/// quantile in training.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct NoveltyScale {
@@ -149,6 +189,9 @@ pub struct NoveltyScale {
     pub still_median: f32,
     /// 95 % quantile of the distance from that median.
     pub still_scale: f32,
+    /// The look that follows from the pose, where the model reads one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub at_pose: Option<LookAtPose>,
     /// Evenly spaced quantiles, 0 % to 100 %, of the distance on the validation split.
     pub quantiles: Vec<f32>,
 }
@@ -159,23 +202,20 @@ impl NoveltyScale {
     pub fn appearance_distance(&self, context: &ContextStatistics) -> f64 {
         let centred = context.appearance.iter().zip(&self.mean);
         let centred: Vec<f64> = centred.map(|(x, m)| x - f64::from(*m)).collect();
-        let whitened = self.whitening.iter().map(|row| weighted_sum(row, &centred));
-        let squared: f64 = whitened.map(|value| value.powi(2)).sum();
-        squared.sqrt() / f64::from(self.appearance_scale)
+        whitened_length(&self.whitening, &centred) / f64::from(self.appearance_scale)
     }
 
-    /// How far a context is from the training data; 5 % of the training contexts have about 1 or more.
-    #[must_use]
-    pub fn distance(&self, context: &ContextStatistics) -> f64 {
+    /// How far the frames of a context are from the training data.
+    fn distance(&self, context: &ContextStatistics) -> f64 {
         let still = (context.still - f64::from(self.still_median)).abs() / f64::from(self.still_scale);
         self.appearance_distance(context).max(still)
     }
 
-    /// The share of the validation contexts that are nearer to the training data, 0…1. Frames unlike those of the training
-    /// have nearly 1.
+    /// The share of the validation contexts that are nearer to the training data than this [`Calibration::distance`], 0…1.
+    /// Frames, states and actions unlike those of the training have nearly 1.
     #[must_use]
-    pub fn novelty(&self, context: &ContextStatistics) -> f32 {
-        let distance = self.distance(context) as f32;
+    pub fn novelty(&self, distance: f64) -> f32 {
+        let distance = distance as f32;
         let above = self.quantiles.partition_point(|&quantile| quantile < distance);
         let Some(below) = above.checked_sub(1) else {
             return 0.0;
@@ -253,6 +293,12 @@ impl RolloutInContext<'_> {
     }
 }
 
+/// Of values times the rows of a matrix.
+fn whitened_length(whitening: &[Vec<f32>], values: &[f64]) -> f64 {
+    let squares = whitening.iter().map(|row| weighted_sum(row, values).powi(2));
+    squares.sum::<f64>().sqrt()
+}
+
 fn weighted_sum(weights: &[f32], values: &[f64]) -> f64 {
     weights.iter().zip(values).map(|(w, x)| f64::from(*w) * x).sum()
 }
@@ -274,6 +320,7 @@ mod tests {
             appearance_scale: 1.0,
             still_median: 0.0,
             still_scale: 1e9,
+            at_pose: None,
             quantiles: quantiles.to_vec(),
         }
     }
@@ -313,9 +360,10 @@ mod tests {
     fn novelty_is_the_share_of_nearer_contexts() {
         let scale = scale_of(&[0.1, 0.2, 0.4]);
         for (mean, novelty) in [(0.05, 0.0), (0.15, 0.25), (0.2, 0.5), (0.3, 0.75), (0.5, 1.0)] {
-            assert!((scale.novelty(&brightness(mean)) - novelty).abs() < 1e-5, "{mean}");
+            let distance = scale.distance(&brightness(mean));
+            assert!((scale.novelty(distance) - novelty).abs() < 1e-5, "{mean}");
         }
-        assert_eq!(scale_of(&[]).novelty(&brightness(0.5)), 0.0);
+        assert_eq!(scale_of(&[]).novelty(0.5), 0.0);
     }
 
     #[test]

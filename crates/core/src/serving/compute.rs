@@ -232,9 +232,11 @@ impl<'a> Windows<'a> {
             frames: &frames,
             actions: &actions,
         };
+        let state = input.state.as_ref().map(RobotState::as_slice);
+        let distance = calibration.distance(spec, context, state, &actions);
         Rollout {
             errors: rollout.expected_errors(calibration),
-            novelty: Some(calibration.novelty.novelty(context)),
+            novelty: Some(calibration.novelty.novelty(distance)),
             frames,
         }
     }

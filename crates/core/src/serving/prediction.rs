@@ -66,8 +66,8 @@ pub struct Rollout {
     pub frames: Vec<Frame>,
     /// The errors to expect of the frames up to the model's horizon; empty if the model is not calibrated.
     pub errors: Vec<ExpectedError>,
-    /// How unlike the training data the context is, 0…1: the share of validation contexts that are nearer to it; `None` if the
-    /// model is not calibrated.
+    /// How unlike the training data frames, state and actions are, 0…1: the share of validation contexts that are nearer to it;
+    /// `None` if the model is not calibrated.
     pub novelty: Option<f32>,
 }
 

@@ -8,13 +8,13 @@ use std::sync::atomic::AtomicBool;
 use super::config::EvaluateConfig;
 use super::forecast::{Forecast, contexts, forecasts};
 use super::inference::Inference;
-use super::least_squares::{factor, forward, mean_and_deviation, second_moments, solve};
+use super::least_squares::{factor, second_moments, solve};
+use super::novelty_scale::novelty_scale;
 use super::progress::{EvaluationContext, EvaluationProgress};
+use super::statistics::{mean_and_deviation, quantile, rounded};
 use super::windows::{evenly, window_shape};
 use super::{EvaluationError, compatible};
-use foreframe_core::registry::calibration::{
-    APPEARANCE, Calibration, ContextStatistics, ERROR_INPUTS, NoveltyScale, StepErrors, ValueRange,
-};
+use foreframe_core::registry::calibration::{Calibration, ERROR_INPUTS, StepErrors, ValueRange, pose_features};
 use foreframe_core::registry::{self, Model};
 use foreframe_data::dataset::sampler::{Split, Splits};
 use foreframe_data::dataset::{Dataset, Window};
@@ -23,15 +23,13 @@ use foreframe_data::dataset::{Dataset, Window};
 const TRAINING_WINDOWS: usize = 3000;
 /// Share of the errors below the band, and above it.
 const TAIL: f64 = 0.05;
-/// The quantile to which distances are scaled.
-const SCALED_TO: f64 = 0.95;
 /// Intervals between the stored quantiles of the distance.
 const QUANTILE_STEPS: usize = 40;
 /// Errors below it count as it, so that their logarithm is finite.
 const LEAST_ERROR: f64 = 1e-9;
-/// Added to standard deviations of the statistics: nothing varies less in a real camera.
+/// An input that varies less never changes.
 const LEAST_SPREAD: f64 = 2e-4;
-/// Added to correlations, and to the mean squares of the inputs, so that the equations can be solved.
+/// Added to the mean squares of the inputs, so that the equations can be solved.
 const RIDGE: f64 = 1e-2;
 
 /// Fits the calibration on the training and the validation split. `config` says with which seed the data set is split, how
@@ -62,28 +60,32 @@ pub fn calibrate(
         config,
         on_progress,
     };
-    let seen = contexts(&evaluation(Split::Train), &evenly(&training, TRAINING_WINDOWS))?;
-    let mut novelty = novelty_scale(&seen);
-    let validation = evenly(&validation, config.max_windows);
-    let found = forecasts(&evaluation(Split::Validation), &validation, &novelty)?;
-    let distances = found.iter().map(|forecast| novelty.distance(&forecast.context));
-    let distances: Vec<f64> = distances.collect();
-    novelty.quantiles = (0..=QUANTILE_STEPS)
-        .map(|step| quantile(distances.clone(), step as f64 / QUANTILE_STEPS as f64) as f32)
-        .collect();
     let spec = loaded.spec();
+    let seen_windows = evenly(&training, TRAINING_WINDOWS);
+    let seen = contexts(&evaluation(Split::Train), &seen_windows)?;
+    let poses = seen_windows
+        .iter()
+        .filter_map(|window| pose_features(spec, dataset.state(window.first_frame + spec.context - 1)));
     let range = |used: Option<usize>, values: &dyn Fn(usize) -> Vec<f32>| match used {
         Some(channels) => ranges(&training, shape.frames(), channels, values),
         None => Vec::new(),
     };
-    Ok(Calibration {
+    let validation = evenly(&validation, config.max_windows);
+    let mut calibration = Calibration {
         dataset_content_hash: dataset.info().content_hash.clone(),
-        windows: found.len(),
-        steps: (0..spec.horizon).map(|step| step_errors(&found, step)).collect(),
+        windows: validation.len(),
+        steps: Vec::new(),
+        novelty: novelty_scale(&seen, &poses.collect::<Vec<_>>()),
         actions: range(spec.action_inputs(), &|frame| dataset.action(frame).to_vec()),
         states: range(spec.state_inputs(), &|frame| dataset.state(frame).to_vec()),
-        novelty,
-    })
+    };
+    let found = forecasts(&evaluation(Split::Validation), &validation, &calibration)?;
+    let distances: Vec<f64> = found.iter().map(|forecast| forecast.distance).collect();
+    calibration.novelty.quantiles = (0..=QUANTILE_STEPS)
+        .map(|step| quantile(distances.clone(), step as f64 / QUANTILE_STEPS as f64) as f32)
+        .collect();
+    calibration.steps = (0..spec.horizon).map(|step| step_errors(&found, step)).collect();
+    Ok(calibration)
 }
 
 /// Calibrates a model that was just trained on this data set and writes the calibration into its manifest, unless it has
@@ -120,36 +122,6 @@ fn ranges(windows: &[Window], frames: usize, channels: usize, values: &dyn Fn(us
         }
     }
     ranges
-}
-
-/// What the contexts of the training look like. The quantiles are filled in later.
-fn novelty_scale(seen: &[ContextStatistics]) -> NoveltyScale {
-    let statistics: [[f64; 2]; APPEARANCE] =
-        array::from_fn(|at| mean_and_deviation(seen.iter().map(|context| context.appearance[at])));
-    let mean = statistics.map(|[mean, _]| mean);
-    let spread = statistics.map(|[_, deviation]| deviation + LEAST_SPREAD);
-    let scaled = |context: &ContextStatistics| array::from_fn(|at| (context.appearance[at] - mean[at]) / spread[at]);
-    let rows: Vec<[f64; APPEARANCE]> = seen.iter().map(scaled).collect();
-    let factor = factor(&second_moments(&rows), APPEARANCE, RIDGE)
-        .expect("correlations with a ridge that are not positive is a bug");
-    // Column by column: the inverse of the factor, over the spread.
-    let column = |at: usize| forward(&factor, (0..APPEARANCE).map(|row| f64::from(row == at)).collect());
-    let columns: [Vec<f64>; APPEARANCE] = array::from_fn(column);
-    let row = |row: usize| (0..=row).map(|at| rounded(columns[at][row] / spread[at])).collect();
-    let still: Vec<f64> = seen.iter().map(|context| context.still).collect();
-    let still_median = quantile(still.clone(), 0.5);
-    let from_median = still.iter().map(|still| (still - still_median).abs()).collect();
-    let mut scale = NoveltyScale {
-        mean: mean.map(rounded).to_vec(),
-        whitening: (0..APPEARANCE).map(row).collect(),
-        appearance_scale: 1.0,
-        still_median: rounded(still_median),
-        still_scale: rounded(quantile(from_median, SCALED_TO).max(LEAST_SPREAD)),
-        quantiles: Vec::new(),
-    };
-    let lengths = seen.iter().map(|context| scale.appearance_distance(context)).collect();
-    scale.appearance_scale = rounded(quantile(lengths, SCALED_TO).max(LEAST_SPREAD));
-    scale
 }
 
 /// Least squares of the logarithm of the errors of a step, and the factors that its residuals give.
@@ -197,21 +169,6 @@ fn step_errors(found: &[Forecast], step: usize) -> StepErrors {
     fitted
 }
 
-/// The value below which this share of the values lies; between two values in proportion. There is at least one value.
-pub(super) fn quantile(mut values: Vec<f64>, share: f64) -> f64 {
-    values.sort_by(f64::total_cmp);
-    let place = share * (values.len() - 1) as f64;
-    let (below, above) = (place.floor() as usize, place.ceil() as usize);
-    values[below] + (values[above] - values[below]) * place.fract()
-}
-
-/// Five digits, so that the manifest stays readable.
-fn rounded(value: f64) -> f32 {
-    format!("{value:.4e}")
-        .parse()
-        .expect("a formatted number that cannot be read is a bug")
-}
-
 #[cfg(test)]
 mod tests {
     use rand::Rng as _;
@@ -228,7 +185,8 @@ mod tests {
             inputs[3] = rng.random_range(-1.0..1.0);
             let noise: f64 = rng.random_range(-0.4..0.4);
             Forecast {
-                context: ContextStatistics::of(&[0.5; 64], &[0.5; 64], 8),
+                distance: 0.5,
+                distance_from_start: None,
                 inputs: vec![inputs],
                 errors: vec![(-6.0 + inputs[0] - 0.5 * inputs[3] + noise).exp()],
                 expected: Vec::new(),
@@ -257,26 +215,5 @@ mod tests {
         });
         let share = inside.count() as f64 / new.len() as f64;
         assert!((share - 0.9).abs() < 0.03, "{share}");
-    }
-
-    #[test]
-    fn contexts_unlike_those_of_the_training_are_far_away() {
-        let textured = |seed: u64, size: f32| {
-            let mut rng = Seed(seed).rng();
-            let phase: f32 = rng.random_range(0.0..6.0);
-            let image: Vec<f32> = (0..256)
-                .map(|at| 0.5 + size * (at as f32 * 0.3 + phase).sin())
-                .collect();
-            let moved: Vec<f32> = image
-                .iter()
-                .map(|value| value + rng.random_range(-0.05..0.05))
-                .collect();
-            ContextStatistics::of(&image, &moved, 16)
-        };
-        let seen: Vec<ContextStatistics> = (0..300).map(|seed| textured(seed, 0.2)).collect();
-        let scale = novelty_scale(&seen);
-        let far = seen.iter().filter(|context| scale.distance(context) > 1.0).count();
-        assert!((15..=30).contains(&far), "{far}");
-        assert!(scale.distance(&textured(1000, 0.4)) > 2.0);
     }
 }

@@ -2,6 +2,7 @@
 
 use super::EvaluationError;
 use foreframe_core::error_text::comma_separated;
+use foreframe_core::nn::ModelSpec;
 use foreframe_core::registry::Model;
 use foreframe_core::types::Seed;
 use foreframe_data::dataset::Dataset;
@@ -45,6 +46,11 @@ pub(super) fn check(loaded: &Model, dataset: &Dataset) -> Result<(), EvaluationE
         }
     }
     Ok(())
+}
+
+/// Whether the data set's states are those that the model takes.
+pub(super) fn has_states_of(spec: &ModelSpec, dataset: &Dataset) -> bool {
+    spec.state_inputs().is_some() && comma_separated(&spec.states) == comma_separated(&dataset.info().state_channels)
 }
 
 /// Errors: `TrainedOn` if the model was trained on this data set, so that it cannot be tested on all of it.

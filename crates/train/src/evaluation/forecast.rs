@@ -5,15 +5,17 @@ use super::inference::ActionSource;
 use super::progress::{EvaluationContext, EvaluationStage};
 use foreframe_core::registry::Model;
 use foreframe_core::registry::calibration::{
-    Calibration, ContextStatistics, ERROR_INPUTS, ExpectedError, NoveltyScale, RolloutInContext,
+    Calibration, ContextStatistics, ERROR_INPUTS, ExpectedError, RolloutInContext,
 };
 use foreframe_data::dataset::Window;
 
 /// A predicted window, what was known of it, and its true errors.
 #[derive(Clone, Debug)]
 pub(super) struct Forecast {
-    /// The last two frames seen.
-    pub(super) context: ContextStatistics,
+    /// How far frames, state and actions are from the training data.
+    pub(super) distance: f64,
+    /// The same with the pose counted from the trial's start, as an odometry does it; none if the model reads no pose.
+    pub(super) distance_from_start: Option<f64>,
     /// What the expected error is computed from, for each step.
     pub(super) inputs: Vec<[f64; ERROR_INPUTS]>,
     /// Mean squared error of each step, intensities 0…1.
@@ -26,10 +28,10 @@ pub(super) struct Forecast {
 pub(super) fn forecasts(
     evaluation: &EvaluationContext,
     windows: &[Window],
-    novelty: &NoveltyScale,
+    calibration: &Calibration,
 ) -> Result<Vec<Forecast>, EvaluationError> {
     evaluation.in_batches(EvaluationStage::Calibration, windows, |batch| {
-        forecast_batch(evaluation, batch, novelty)
+        forecast_batch(evaluation, batch, calibration)
     })
 }
 
@@ -51,7 +53,7 @@ pub(super) fn contexts(
 fn forecast_batch(
     evaluation: &EvaluationContext,
     windows: &[Window],
-    novelty: &NoveltyScale,
+    calibration: &Calibration,
 ) -> Result<Vec<Forecast>, EvaluationError> {
     let (inference, spec) = (evaluation.inference, evaluation.inference.spec());
     let Model { manifest, network, .. } = inference.loaded;
@@ -73,11 +75,16 @@ fn forecast_batch(
             actions: &predicted.actions[index * actions_each..][..actions_each],
         };
         let expected = |calibration: &Calibration| rollout.expected_errors(calibration);
+        let distance = |state: &[f32]| calibration.distance(spec, &context, Some(state), rollout.actions);
+        let dataset = inference.dataset;
+        let start = dataset.state(dataset.episodes()[window.episode].first_frame);
+        let last = dataset.state(window.first_frame + spec.context - 1);
         found.push(Forecast {
-            inputs: rollout.error_inputs(novelty),
+            distance: distance(last),
+            distance_from_start: spec.counted_from(start, last).map(|state| distance(&state)),
+            inputs: rollout.error_inputs(&calibration.novelty),
             expected: manifest.calibration.as_ref().map(expected).unwrap_or_default(),
             errors: inference.step_errors(window, values)?,
-            context,
         });
     }
     Ok(found)

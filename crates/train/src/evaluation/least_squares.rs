@@ -1,14 +1,6 @@
-//! What fits by least squares need: means and spreads, and systems of linear equations with a symmetric positive matrix,
+//! What fits by least squares need: systems of linear equations with a symmetric positive matrix,
 //! solved by Cholesky's factorization. Matrices are row by row. nalgebra's factorization adds in another order, so that scores
 //! and calibrations would get other last digits.
-
-/// Mean and standard deviation of values; there is at least one.
-pub(super) fn mean_and_deviation(values: impl ExactSizeIterator<Item = f64> + Clone) -> [f64; 2] {
-    let count = values.len() as f64;
-    let mean = values.clone().sum::<f64>() / count;
-    let squares = values.map(|value| (value - mean).powi(2));
-    [mean, (squares.sum::<f64>() / count).sqrt()]
-}
 
 /// The means of the products of each two of the N values of a row.
 pub(super) fn second_moments<const N: usize>(rows: &[[f64; N]]) -> Vec<f64> {

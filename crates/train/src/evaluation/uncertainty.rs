@@ -4,12 +4,13 @@
 use serde::{Deserialize, Serialize};
 
 use super::EvaluationError;
-use super::calibrate::quantile;
+use super::compatible::has_states_of;
 use super::forecast::{Forecast, contexts, forecasts};
 use super::metrics::StepCurve;
 use super::progress::EvaluationContext;
+use super::statistics::quantile;
 use super::windows::evenly;
-use foreframe_core::registry::calibration::Calibration;
+use foreframe_core::registry::calibration::{Calibration, ContextStatistics};
 use foreframe_data::dataset::Window;
 
 /// How well the expected errors of a set's windows fit the true ones.
@@ -25,6 +26,10 @@ pub struct UncertaintyScores {
     pub correlation: StepCurve,
     /// Mean novelty of the windows; 0.5 where they are like the validation split.
     pub novelty: f64,
+    /// For models that read a pose in a room: how often a window has a greater novelty when poses are counted from its trial's
+    /// start, as an odometry does it (area under the ROC curve).
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub wrong_origin_auroc: Option<f64>,
 }
 
 /// How well novelty tells another data set from the windows of the evaluation.
@@ -47,11 +52,11 @@ pub(super) fn measure(
     calibration: &Calibration,
     windows: &[Window],
 ) -> Result<(UncertaintyScores, Vec<f64>), EvaluationError> {
-    let found = forecasts(evaluation, windows, &calibration.novelty)?;
-    let novelty = found
-        .iter()
-        .map(|forecast| calibration.novelty.novelty(&forecast.context));
-    let novelty: Vec<f64> = novelty.map(f64::from).collect();
+    let found = forecasts(evaluation, windows, calibration)?;
+    let novelty_of = |distance| f64::from(calibration.novelty.novelty(distance));
+    let novelty: Vec<f64> = found.iter().map(|forecast| novelty_of(forecast.distance)).collect();
+    let from_start = found.iter().filter_map(|forecast| forecast.distance_from_start);
+    let from_start: Vec<f64> = from_start.map(novelty_of).collect();
     let steps = calibration.steps.len();
     let curve = |of: &dyn Fn(usize) -> f64| StepCurve::new((0..steps).map(of).collect());
     let scores = UncertaintyScores {
@@ -65,6 +70,7 @@ pub(super) fn measure(
         }),
         correlation: curve(&|step| correlation(&found, step)),
         novelty: mean(&novelty),
+        wrong_origin_auroc: (!from_start.is_empty()).then(|| auroc(&novelty, &from_start)),
     };
     Ok((scores, novelty))
 }
@@ -121,10 +127,15 @@ pub(super) fn compare(
         });
     }
     let windows = evenly(&windows, evaluation.config.max_windows);
-    let novelty = contexts(evaluation, &windows)?.into_iter();
-    let novelty: Vec<f64> = novelty
-        .map(|context| f64::from(calibration.novelty.novelty(&context)))
-        .collect();
+    let spec = evaluation.inference.spec();
+    let has_states = has_states_of(spec, dataset);
+    let of_window = |(window, statistics): (&Window, ContextStatistics)| {
+        let state = has_states.then(|| dataset.state(window.first_frame + context - 1));
+        let distance = calibration.distance(spec, &statistics, state, &[]);
+        f64::from(calibration.novelty.novelty(distance))
+    };
+    let found = contexts(evaluation, &windows)?;
+    let novelty: Vec<f64> = windows.iter().zip(found).map(of_window).collect();
     Ok(NoveltyScores {
         dataset: dataset.info().name.clone(),
         windows: windows.len(),

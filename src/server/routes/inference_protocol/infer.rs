@@ -213,13 +213,14 @@ fn outputs(prediction: Prediction, is_float: bool, has_plans: bool) -> Vec<Tenso
         values,
     };
     let mut tensors = Vec::new();
-    if let Some(novelty) = rollouts.first().and_then(|rollout| rollout.novelty) {
+    let novelty: Vec<f32> = rollouts.iter().filter_map(|rollout| rollout.novelty).collect();
+    if !novelty.is_empty() {
         let errors = rollouts[0].errors.len();
         let expected: Vec<f32> = rollouts.iter().flat_map(Rollout::expected_mse).collect();
         let bands: Vec<f32> = rollouts.iter().flat_map(Rollout::mse_bands).flatten().collect();
         tensors.push(tensor("expected_mse", &[errors], Values::Fp32(expected)));
         tensors.push(tensor("mse_band_90", &[errors, 2], Values::Fp32(bands)));
-        tensors.push(tensor("novelty", &[1], Values::Fp32(vec![novelty; rollouts.len()])));
+        tensors.push(tensor("novelty", &[1], Values::Fp32(novelty)));
     }
     let frames = rollouts.into_iter().flat_map(|rollout| rollout.frames);
     let pixels: Vec<u8> = frames.flat_map(Frame::into_pixels).collect();

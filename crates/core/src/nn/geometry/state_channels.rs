@@ -119,6 +119,30 @@ impl ModelSpec {
             .collect()
     }
 
+    /// Where in its room the robot is: x and y in standard deviations of the training, and the heading in radians. `None` if
+    /// the model takes no pose, or reads only how poses differ.
+    pub(crate) fn absolute_pose(&self, state: &[f32]) -> Option<[f32; 3]> {
+        let channels = StateChannels::of(self);
+        let [x, y, ..] = channels.pose.filter(|_| !self.reads_past_states())?;
+        let scaled = |channel: usize| self.states[channel].scaled(state[channel]);
+        (state.len() == self.states.len()).then(|| [scaled(x), scaled(y), channels.pose_in(state).heading])
+    }
+
+    /// A state with its pose counted from another one's, as an odometry that started there has it. `None` where
+    /// [`Self::absolute_pose`] is none.
+    #[doc(hidden)]
+    #[must_use]
+    pub fn counted_from(&self, start: &[f32], state: &[f32]) -> Option<Vec<f32>> {
+        self.absolute_pose(state)?;
+        let channels = StateChannels::of(self);
+        let [x, y, cos, sin] = channels.pose?;
+        let [yaw, ahead, left] = channels.pose_in(start).motion_to(channels.pose_in(state));
+        let mut counted = state.to_vec();
+        (counted[x], counted[y]) = (ahead, left);
+        (counted[sin], counted[cos]) = yaw.sin_cos();
+        Some(counted)
+    }
+
     /// Whether a prediction uses the states at the context's earlier frames: it says from the poses how the camera has moved.
     #[must_use]
     pub fn reads_past_states(&self) -> bool {

@@ -5,7 +5,8 @@ use rayon::prelude::*;
 
 use super::input::BaselineInput;
 use crate::evaluation::EvaluationError;
-use crate::evaluation::least_squares::{factor, mean_and_deviation, solve};
+use crate::evaluation::least_squares::{factor, solve};
+use crate::evaluation::statistics::mean_and_deviation;
 use crate::evaluation::windows::evenly;
 use foreframe_core::frame::preprocess::Preprocess;
 use foreframe_core::frame::warp::sample;

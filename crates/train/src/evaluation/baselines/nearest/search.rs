@@ -5,7 +5,7 @@ use rayon::prelude::*;
 use super::small::{SmallImages, squared_byte_distance, squared_distance};
 use crate::evaluation::EvaluationError;
 use crate::evaluation::baselines::input::BaselineInput;
-use crate::evaluation::least_squares::mean_and_deviation;
+use crate::evaluation::statistics::mean_and_deviation;
 use foreframe_data::dataset::sampler::WindowShape;
 use foreframe_data::dataset::{Dataset, Window};
 
