@@ -234,7 +234,11 @@ fn a_restore_killed_at_any_time_leaves_no_file_of_another_backup() {
         // On Unix this is SIGKILL.
         killed.kill().unwrap();
         killed.wait().unwrap();
-        let mut left = if restored.exists() { contents(&restored) } else { Vec::new() };
+        let mut left = if restored.exists() {
+            contents(&restored)
+        } else {
+            Vec::new()
+        };
         left.retain(|(path, _)| path != Path::new("restore.lock"));
         if left == whole {
             // The restore had ended, though the process perhaps had not.

@@ -109,7 +109,7 @@ def drive(program, models, frames, compressed):
     for error, prediction, frame in zip(errors, predicted, truth):
         own = float(numpy.mean((prediction - frame / 255) ** 2))
         assert abs(error - own) < 1e-6, (error, own)
-    assert len(listener.of("/foreframe/expected_error")) == len(predicted)
+    listener.wait(lambda: len(listener.of("/foreframe/expected_error")) == len(predicted), "the last expected error")
     mean, still = numpy.mean(errors), numpy.mean([numpy.mean((old / 255.0 - new / 255.0) ** 2) for old, new in zip(seen[HORIZON - 1 :], truth)])
     print(f"{'compressed' if compressed else 'raw'} images: {len(predicted)} predictions, mean error {mean:.4f}; that of the last frame {still:.4f}")
     assert mean < still
