@@ -13,11 +13,16 @@ fn collect(name: &str, trials: u64) -> Value {
     json!({"kind": "collect", "name": name, "scenario": "static-observer", "trials": trials})
 }
 
-/// The process ids of a process's children.
+/// The process ids of a server's jobs. A child that has not yet become a job does not count: while it is stopped, the server
+/// waits for it.
 fn children(process: u32) -> Vec<u32> {
     let processes = std::fs::read_dir("/proc").unwrap();
     let ids = processes.filter_map(|entry| entry.unwrap().file_name().to_str()?.parse::<u32>().ok());
-    ids.filter(|id| parent(*id) == Some(process)).collect()
+    let is_job = |id: &u32| {
+        let arguments = std::fs::read_to_string(format!("/proc/{id}/cmdline"));
+        arguments.is_ok_and(|arguments| arguments.contains("run-job"))
+    };
+    ids.filter(|id| parent(*id) == Some(process) && is_job(id)).collect()
 }
 
 /// The parent of a process that is alive: the second field of its status after its name.

@@ -193,7 +193,8 @@ fn an_import_waits_for_a_failing_file_system() {
         .server
         .wait_for_job("job-1", |job| job["progress"]["done"].as_u64() > Some(0));
     failing.fail_with(EIO);
-    std::thread::sleep(Duration::from_secs(4));
+    // On a busy machine the job writes seldom.
+    std::thread::sleep(Duration::from_secs(8));
     failing.mend();
     let imported = failing.wait_for_success("job-1");
     assert_eq!(
