@@ -79,7 +79,7 @@ impl HasErrorKind for BridgeError {
 }
 
 /// What the bridge tells its user.
-#[derive(Clone, Debug)]
+#[derive(Debug)]
 pub(crate) enum BridgeEvent {
     /// It is connected to a robot of that name.
     Connected(String),
@@ -92,6 +92,8 @@ pub(crate) enum BridgeEvent {
     },
     /// It predicted.
     Predicted(LiveStep),
+    /// A message could not be read, and was left out.
+    LeftOut(BridgeError),
 }
 
 /// Predicts for the robot at `address` until cancelled or until the connection ends. Errors: every [`BridgeError`].
@@ -132,8 +134,14 @@ pub(crate) fn run(
                 let Some(role) = protocol::role_of(subscription) else {
                     continue;
                 };
-                let Some(seen) = topics.read(role, &payload)? else {
-                    continue;
+                let seen = match topics.read(role, &payload) {
+                    Ok(Some(seen)) => seen,
+                    Ok(None) => continue,
+                    Err(error @ BridgeError::Message { .. }) => {
+                        on_event(BridgeEvent::LeftOut(error));
+                        continue;
+                    }
+                    Err(error) => return Err(error),
                 };
                 let Some(step) = take(&mut prediction, seen, time_ns)? else {
                     continue;

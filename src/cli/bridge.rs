@@ -3,6 +3,8 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use tracing::warn;
+
 use super::error::CliError;
 use super::interrupt;
 use super::process::print_line;
@@ -73,11 +75,19 @@ struct BridgeLog {
     frames: u64,
     latest: LiveStep,
     printed: Option<Instant>,
+    complained: Option<Instant>,
 }
 
 impl BridgeLog {
     fn on_event(&mut self, event: BridgeEvent) {
         let line = match event {
+            BridgeEvent::LeftOut(error) => {
+                if self.complained.is_none_or(|at| at.elapsed() >= LINE_EVERY) {
+                    self.complained = Some(Instant::now());
+                    warn!("left out: {error}");
+                }
+                return;
+            }
             BridgeEvent::Connected(name) => format!("connected to \"{name}\""),
             BridgeEvent::Subscribed { role, topic } => {
                 let what = match role {

@@ -151,6 +151,8 @@ fn a_robot_gets_predictions_and_their_errors() {
         robot.data(camera, time_ns, &message);
     };
     send_image(&mut robot, 0, &frame(99));
+    // One that cannot be read is left out.
+    robot.data(camera, 1, b"half an image");
     robot.data(command, 1, &twist(false, 0.5, 0.1));
     robot.data(odom, 1, &odometry(1, 0.2, 0.0, 0.5));
     let (mut predicted, begin) = (Vec::new(), 1_000_000_000);
@@ -193,7 +195,8 @@ fn a_robot_gets_predictions_and_their_errors() {
         "{out}"
     );
     assert!(
-        error.contains("could not read from the robot at ws://127.0.0.1:"),
+        error.contains("left out: a message of /camera/image cannot be read")
+            && error.contains("could not read from the robot at ws://127.0.0.1:"),
         "{error}"
     );
 }

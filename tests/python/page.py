@@ -207,11 +207,11 @@ def a_dream_goes_on_and_is_saved(browser, server):
 def a_plan_is_chosen_and_taken(browser, server):
     page = browser.open("what-if")
     wait_until(lambda: page.locator(".plan.best").count() == 1, "a best plan")
-    wait_for_pictures(page, 8, ".plan canvas")
+    wait_for_pictures(page, 9, ".plan canvas")
     present = page.evaluate("document.querySelector('.overview canvas').toDataURL()")
     page.get_by_role("button", name="hard left").click()
     wait_until(lambda: page.evaluate("document.querySelector('.overview canvas').toDataURL()") != present, "the robot moves")
-    wait_until(lambda: page.locator(".plan:enabled").count() == 8, "plans from the new place")
+    wait_until(lambda: page.locator(".plan:enabled").count() == 9, "plans from the new place")
     page.context.close()
 
 

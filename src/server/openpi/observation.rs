@@ -33,7 +33,7 @@ pub(super) struct OpenpiObservation {
     /// The future actions, `[steps, channels]`. Without them, `action` is repeated.
     actions: Option<ReceivedArray>,
     /// How many frames to predict. Default: the model's horizon.
-    steps: Option<usize>,
+    steps: Option<ReceivedArray>,
 }
 
 /// What a message asks for, in the words of other servers of openpi's protocol.
@@ -53,7 +53,7 @@ impl OpenpiObservation {
             action: self.action.map(|array| vector("action", array)).transpose()?,
             plan: self.actions.map(|array| rows("actions", array)).transpose()?,
             state: self.state.map(|array| vector("state", array)).transpose()?,
-            steps: self.steps,
+            steps: self.steps.map(|number| whole("steps", number)).transpose()?,
         };
         let frame = self.frame.ok_or_else(|| {
             let reason = "frame is missing; it is an array uint8 [height, width] or [height, width, 3]";
@@ -79,6 +79,15 @@ fn image(array: ReceivedArray) -> Result<Frame, StepError> {
     let shape = array.shape.clone();
     let values = array.bytes().map_err(|reason| wrong("frame", &reason))?;
     Ok(images::from_array("frame", &shape, values)?)
+}
+
+/// A whole number from 0 on; of `NumPy` or not.
+fn whole(key: &str, number: ReceivedArray) -> Result<usize, StepError> {
+    let values = number.numbers().map_err(|reason| wrong(key, &reason))?;
+    match values[..] {
+        [value] if value >= 0.0 && value.fract() == 0.0 => Ok(value as usize),
+        _ => Err(wrong(key, "must be one whole number")),
+    }
 }
 
 /// The numbers of one row.

@@ -16,6 +16,7 @@ import { Copy, curl, requests } from "./snippets.js";
 const PLANS = [
   ["hard left", 0.6, 1.4, "--blue"], ["left", 1, 0.6, "--teal"], ["straight", 1, 0, "--green"], ["right", 1, -0.6, "--orange"],
   ["hard right", 0.6, -1.4, "--red"], ["slow", 0.3, 0, "--violet"], ["fast", 1.3, 0, "--ink"], ["back", -0.6, 0, "--quiet"],
+  ["stop", 0, 0, "--line"],
 ];
 
 // The present: the frame that no action followed yet, and those before it.

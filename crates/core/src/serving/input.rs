@@ -3,7 +3,7 @@
 use super::conditioning::{ConditioningInput, REQUEST_FIELDS, RawConditioning, past_states_used};
 use super::error::InputError;
 use super::ranges::range_warnings;
-use super::task::{Task, check_frames};
+use super::task::{Task, check_frames, unused};
 use crate::frame::Frame;
 use crate::frame::warp::CameraModel;
 use crate::registry::Manifest;
@@ -61,10 +61,12 @@ impl PredictionInput {
         ConditioningInput::new(raw, &REQUEST_FIELDS, manifest)
     }
 
-    /// What in the input is out of the range that the model saw in training; nothing if the manifest has no ranges.
-    /// Errors: as [`PredictionInput::check`].
+    /// What in the input the model does not use, and what is out of the range that it saw in training, if the manifest has
+    /// ranges. Errors: as [`PredictionInput::check`].
     pub fn warnings(&self, manifest: &Manifest) -> Result<Vec<String>, InputError> {
-        Ok(range_warnings(manifest, &[self.conditioning(manifest)?]))
+        let mut warnings = unused(self.camera.is_some(), self.plan.is_some(), manifest);
+        warnings.extend(range_warnings(manifest, &[self.conditioning(manifest)?]));
+        Ok(warnings)
     }
 
     /// The input as a task with one rollout. Errors: as [`PredictionInput::check`].
@@ -72,6 +74,7 @@ impl PredictionInput {
     pub fn into_task(self, manifest: &Manifest) -> Result<Task, InputError> {
         Ok(Task {
             conditioning_inputs: vec![self.checked(manifest)?],
+            warnings: unused(self.camera.is_some(), self.plan.is_some(), manifest),
             past_states: past_states_used(self.past_states, manifest)?,
             camera: self.camera,
             frames: self.frames,

@@ -121,7 +121,8 @@ impl Predictor {
         session: Option<u64>,
     ) -> Result<Prediction, ServingError> {
         let deadline = Instant::now() + self.shared.deadline;
-        let warnings = range_warnings(&model.manifest, &task.conditioning_inputs);
+        let mut warnings = std::mem::take(&mut task.warnings);
+        warnings.extend(range_warnings(&model.manifest, &task.conditioning_inputs));
         let first = task.next_part(self.shared.part_limit);
         let mut whole = self.compute_part(model, first, session, deadline).await?;
         // The first part has encoded the frames; the others predict from their features.

@@ -207,6 +207,7 @@ impl SessionState {
             past_features,
             past_states: last_states(past_states.cloned().collect(), spec),
             camera: self.camera,
+            warnings: Vec::new(),
             frames: vec![frame],
             conditioning_inputs: conditioning.filter(|_| is_full).into_iter().collect(),
         }
@@ -241,6 +242,7 @@ impl SessionState {
             past_features: self.features.iter().cloned().collect(),
             past_states: last_states(self.past_states.iter().cloned().collect(), spec),
             camera: self.camera,
+            warnings: Vec::new(),
             frames: Vec::new(),
             conditioning_inputs,
         }

@@ -25,6 +25,8 @@ pub struct Task {
     pub(super) camera: Option<CameraModel>,
     /// One for each rollout; empty while the context is not full.
     pub(super) conditioning_inputs: Vec<ConditioningInput>,
+    /// What of the input the model does not use.
+    pub(super) warnings: Vec<String>,
 }
 
 impl Task {
@@ -40,6 +42,7 @@ impl Task {
         check_frames(&frames, manifest)?;
         Ok(Self {
             past_states: past_states_used(past_states, manifest)?,
+            warnings: unused(camera.is_some(), false, manifest),
             camera,
             frames,
             conditioning_inputs,
@@ -59,8 +62,24 @@ impl Task {
             camera: self.camera,
             frames: std::mem::take(&mut self.frames),
             conditioning_inputs: std::mem::replace(&mut self.conditioning_inputs, later),
+            warnings: Vec::new(),
         }
     }
+}
+
+/// A warning for a camera and for a plan that are given but not used by the model.
+pub(super) fn unused(has_camera: bool, has_plan: bool, manifest: &Manifest) -> Vec<String> {
+    let (model, spec) = (&manifest.name, &manifest.spec);
+    let mut warnings = Vec::new();
+    if has_camera && !spec.flow().is_some_and(|flow| flow.layers.depth) {
+        warnings.push(format!(
+            "camera is not used: the model \"{model}\" does not estimate depth"
+        ));
+    }
+    if has_plan && spec.action_inputs().is_none() {
+        warnings.push(format!("plan is not used: the model \"{model}\" takes no actions"));
+    }
+    warnings
 }
 
 /// Checks that the frames fill the model's context and have its size.
