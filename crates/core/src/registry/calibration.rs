@@ -190,6 +190,7 @@ pub struct NoveltyScale {
     /// 95 % quantile of the distance from that median.
     pub still_scale: f32,
     /// The look that follows from the pose, where the model reads one.
+    #[doc(hidden)]
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub at_pose: Option<LookAtPose>,
     /// Evenly spaced quantiles, 0 % to 100 %, of the distance on the validation split.
