@@ -2,7 +2,7 @@
 //! carried out as it was given. Exit code 1: it failed. Exit code 130: it was interrupted.
 //!
 //! Subcommands do not use each other. What they share is, in the order in which it may use each other: `error`, `new_key`, `next_step`,
-//! `process` and `progress`, `interrupt`, `table`, `scores`, `settings`, `output`, `admin_address`, `workspace`.
+//! `process` and `progress`, `interrupt`, `table`, `scores`, `settings`, `output`, `recorded`, `admin_address`, `workspace`.
 
 mod admin_address;
 mod backup;
@@ -11,6 +11,7 @@ mod calibrate;
 mod collect;
 mod completions;
 mod config;
+mod drive;
 mod error;
 mod evaluate;
 mod export;
@@ -24,10 +25,12 @@ mod models;
 mod new_key;
 mod next_step;
 mod output;
+mod plan;
 mod predict;
 mod process;
 mod progress;
 mod publish;
+mod recorded;
 mod scores;
 mod serve;
 mod settings;
@@ -71,6 +74,8 @@ enum Command {
     Evaluate(evaluate::EvaluateArgs),
     Calibrate(calibrate::CalibrateArgs),
     Predict(predict::PredictArgs),
+    Plan(plan::PlanArgs),
+    Drive(drive::DriveArgs),
     Bridge(bridge::BridgeArgs),
     Serve(serve::ServeArgs),
     Publish(publish::PublishArgs),
@@ -125,6 +130,8 @@ fn run(command: Option<Command>) -> Result<(), CliError> {
         Command::Evaluate(args) => evaluate::run(&args),
         Command::Calibrate(args) => calibrate::run(&args),
         Command::Predict(args) => predict::run(&args),
+        Command::Plan(args) => plan::run(&args),
+        Command::Drive(args) => drive::run(&args),
         Command::Bridge(args) => bridge::run(args),
         Command::Serve(args) => serve::run(&args),
         Command::Publish(args) => publish::run(&args),

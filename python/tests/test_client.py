@@ -94,6 +94,30 @@ def test_rollouts_have_one_row_for_each_plan(client: foreframe.Client, drive: Dr
     assert found.best(lambda frames: float(frames[-1].mean())) == int(np.argmin(dark))
 
 
+def test_a_plan_turns_to_its_goal(client: foreframe.Client, drive: Drive) -> None:
+    goal = foreframe.Goal(position_m=(0.4, 0.3))
+    found = client.plan("rooms", drive.frames[:5], goal, states=drive.states[:5], seed=3, samples=64, budget_ms=5000)
+    assert found.actions.shape == (5, 2) and found.way.shape == (5, 3) and found.samples > 64
+    assert found.clearance_checked and (found.safe or found.kind == "stop")
+    assert found.frames is not None and found.frames.shape == (5, 64, 64)
+    others = [plan for plan in (found, *found.runners_up) if plan.kind == "drawn"]
+    assert others and all(plan.way[-1, 0] > -0.1 for plan in others)
+    by_image = client.plan(
+        MODEL,
+        drive.frames[:5],
+        foreframe.Goal(image=drive.frames[9]),
+        state=drive.states[4],
+        present=drive.actions[4:9],
+        solver="mppi",
+        samples=8,
+        iterations=1,
+        budget_ms=10_000,
+    )
+    assert "goal_image" in by_image.costs and by_image.predicted == 10
+    with pytest.raises(foreframe.ApiError, match="goal is empty"):
+        client.plan(MODEL, drive.frames[:5], foreframe.Goal(), state=drive.states[4])
+
+
 def test_errors_have_the_words_of_the_server(client: foreframe.Client, drive: Drive) -> None:
     with pytest.raises(foreframe.ApiError, match="no model") as missing:
         client.model("nothing")

@@ -179,8 +179,12 @@ def test_a_session_rolls_plans_out_also_after_it_was_lost(client: foreframe.Clie
     with client.session(MODEL) as session:
         answers(session, drive, range(8))
         before = session.rollouts(plans)
+        planned = session.plan(foreframe.Goal(heading_rad=0.5), seed=1, budget_ms=5000)
         forget(client, session)
         after = session.rollouts(plans)
+        forget(client, session)
+        again = session.plan(foreframe.Goal(heading_rad=0.5), seed=1, budget_ms=5000)
+    assert np.array_equal(planned.actions, again.actions) and planned.way[-1, 2] > 0
     assert before.frames.shape == (2, 5, 64, 64) and np.array_equal(before.frames, after.frames)
 
 
@@ -193,6 +197,7 @@ def test_the_async_session_does_the_same(proxy: Proxy, drive: Drive, unbroken: l
                     proxy.cut()
                 found.append(await session.step(drive.frames[n], action=drive.actions[n], state=drive.states[n]))
             await session.rollouts([drive.actions[4:9]])
+            assert (await session.plan(foreframe.Goal(heading_rad=0.2))).actions.shape == (5, 2)
         return found
 
     same(asyncio.run(stream()), unbroken)

@@ -1,17 +1,14 @@
 //! `foreframe predict`
 
-mod actions;
-mod images;
 mod trust;
 
 use std::path::PathBuf;
 
-use self::actions::ActionsFile;
-use self::images::ImagePaths;
 use self::trust::print_trust;
 use super::error::CliError;
 use super::output::OutputDirectory;
 use super::process::print_line;
+use super::recorded::{ActionsFile, ImagePaths};
 use super::settings::CommonArgs;
 use super::workspace::Workspace;
 use foreframe_core::error_text;
@@ -114,23 +111,7 @@ pub(super) fn run(args: &PredictArgs) -> Result<(), CliError> {
 fn select(args: &PredictArgs, name: &ModelName, spec: &ModelSpec) -> Result<Selected, CliError> {
     let mut images = ImagePaths::list(&args.frames, args.resize)?;
     let count = images.count();
-    if count < spec.context {
-        return Err(CliError::Usage(format!(
-            "{} holds {count} PNG or JPEG frames; model {name:?} takes {}",
-            args.frames.display(),
-            spec.context
-        )));
-    }
-    let last = args.at.unwrap_or(count - 1);
-    if !(spec.context - 1..count).contains(&last) {
-        return Err(CliError::Usage(format!(
-            "--at is {last}; it must be {} to {}: model {name:?} takes {} frames, and {} holds {count}",
-            spec.context - 1,
-            count - 1,
-            spec.context,
-            args.frames.display()
-        )));
-    }
+    let last = images.last_of_context(args.at, name, spec)?;
     let end = count.min(last + 1 + spec.horizon);
     Ok(Selected {
         last,

@@ -18,7 +18,7 @@ use super::http::requests;
 use super::openapi;
 use super::routes::{
     audit, datasets, environments, episodes, events, health, inference_protocol, job_events, jobs, metrics, models,
-    openenv, openpi, pages, predict, preview, rollouts, sessions, streams, uploads, world_sessions,
+    openenv, openpi, pages, plans, predict, preview, rollouts, sessions, streams, uploads, world_sessions,
 };
 use super::state::App;
 
@@ -74,6 +74,7 @@ fn request_routes(config: &ServerConfig) -> OpenApiRouter<App> {
         .merge(predict::routes())
         .merge(preview::routes())
         .merge(rollouts::routes())
+        .merge(plans::routes())
         .merge(sessions::routes())
         .merge(jobs::routes(config.max_job_bytes))
         .merge(datasets::routes())

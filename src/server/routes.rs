@@ -14,6 +14,7 @@ pub(super) mod models;
 pub(super) mod openenv;
 pub(super) mod openpi;
 pub(super) mod pages;
+pub(super) mod plans;
 pub(super) mod predict;
 pub(super) mod preview;
 pub(super) mod rollouts;

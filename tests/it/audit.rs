@@ -24,11 +24,13 @@ const AUDITED: [&str; 6] = [
     "DELETE /v1/datasets/{dataset}",
 ];
 /// The operations that change nothing that lasts.
-const NOT_AUDITED: [&str; 15] = [
+const NOT_AUDITED: [&str; 17] = [
     "POST /v1/models/{model}/predict",
     "POST /v1/models/{model}/rollouts",
+    "POST /v1/models/{model}/plan",
     "POST /v1/sessions",
     "POST /v1/sessions/{id}/rollouts",
+    "POST /v1/sessions/{id}/plan",
     "DELETE /v1/sessions/{id}",
     "POST /v1/jobs/estimate",
     // Kept only until its import has ended.

@@ -46,6 +46,7 @@ fn assert_metric(server: &RunningServer, series: &str, value: f64) {
 fn models(dir: &Path) {
     model(dir, "plain", spec(Conditioning::None));
     model(dir, "slow", slow_spec());
+    model(dir, "steered", spec(Conditioning::Action));
     // A model whose answers soon fill a socket.
     let large = ModelSpec {
         frame_width_px: SIDE,
@@ -72,8 +73,8 @@ async fn every_metric_is_measured() {
     ];
     let settings: Vec<&str> = limits.iter().flat_map(|limit| ["--set", limit]).collect();
     let server = RunningServer::start(dir.path(), &settings);
-    assert_metric(&server, "foreframe_models_loaded", 3.0);
-    assert_metric(&server, "foreframe_model_loads_total{outcome=\"ok\"}", 3.0);
+    assert_metric(&server, "foreframe_models_loaded", 4.0);
+    assert_metric(&server, "foreframe_model_loads_total{outcome=\"ok\"}", 4.0);
     assert_metric(&server, "foreframe_model_loads_total{outcome=\"refused\"}", 1.0);
     for name in [
         metric_names::SESSIONS_EVICTED,
@@ -88,6 +89,7 @@ async fn every_metric_is_measured() {
     late_frames(&server).await;
     a_slow_reader(&server).await;
     a_full_queue(&server);
+    a_plan(&server);
     jobs(&server);
     connections(&server);
     let text = server.get("/metrics");
@@ -96,6 +98,15 @@ async fn every_metric_is_measured() {
     }
     server.terminate();
     server.wait_for_exit();
+}
+
+fn a_plan(server: &RunningServer) {
+    let limit = json!({"low": -1.0, "high": 1.0});
+    let search = json!({"limits": [limit, limit], "budget_ms": 5000});
+    let body = json!({"frames": context(), "goal": {"heading_rad": 0.2}, "search": search});
+    server.ask("POST", "/v1/models/steered/plan", &body);
+    assert_metric(server, "foreframe_plans_total{model=\"steered\",outcome=\"safe\"}", 1.0);
+    assert_metric(server, "foreframe_plan_seconds_count{model=\"steered\"}", 1.0);
 }
 
 async fn sessions(server: &RunningServer) {
@@ -254,8 +265,8 @@ fn jobs(server: &RunningServer) {
         );
     }
     wait_for_metric(server, "foreframe_jobs{kind=\"collect\",state=\"running\"}", 0.0);
-    wait_for_metric(server, "foreframe_models_loaded", 4.0);
-    wait_for_metric(server, "foreframe_model_loads_total{outcome=\"ok\"}", 4.0);
+    wait_for_metric(server, "foreframe_models_loaded", 5.0);
+    wait_for_metric(server, "foreframe_model_loads_total{outcome=\"ok\"}", 5.0);
 }
 
 fn post_cancel(server: &RunningServer, id: &str) {
@@ -282,5 +293,5 @@ fn connections(server: &RunningServer) {
         }
         assert!(Instant::now() < deadline);
     };
-    assert!(refused >= 4.0, "{refused}");
+    assert!(refused >= 5.0, "{refused}");
 }

@@ -19,3 +19,5 @@ pub mod nn;
 pub mod registry;
 
 pub mod serving;
+
+pub mod planning;

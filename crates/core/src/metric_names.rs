@@ -55,6 +55,10 @@ names! {
     describe_counter PREDICTIONS_REFUSED = "foreframe_predictions_refused_total" in Count:
         "Predictions that were not computed, by reason: full, deadline, abandoned or error.";
 
+    describe_counter PLANS = "foreframe_plans_total" in Count:
+        "Searches for a plan, by model and outcome: safe, or stop if no plan was safe.";
+    describe_histogram PLAN_SECONDS = "foreframe_plan_seconds" in Seconds: "Time of a search for a plan, by model.";
+
     describe_counter INFERENCE_PANICS = "foreframe_inference_panics_total" in Count:
         "Panics of the inference thread; each failed one batch, and the thread was restarted.";
 

@@ -22,7 +22,7 @@ pub mod session;
 pub use conditioning::{ConditioningInput, FieldNames, OBSERVATION_FIELDS, RawConditioning, STEP_FIELDS};
 pub use error::{InputError, ServingError};
 pub use input::PredictionInput;
-pub use local::{Session, predict};
+pub use local::{Session, compute_task, predict};
 pub use prediction::{Prediction, Rollout, Timing};
 pub use predictor::{Predictor, PredictorConfig};
 pub use session::{SessionSnapshot, SessionState};
@@ -96,6 +96,20 @@ pub fn test_depth_model() -> Model {
         ..spec.states[0].clone()
     };
     spec.states = ["x", "y", "heading_cos", "heading_sin"].map(channel).to_vec();
+    loaded(spec)
+}
+
+/// As [`test_depth_model`], with speeds as actions.
+#[cfg(test)]
+pub fn test_speed_model() -> Model {
+    use crate::nn::{ChannelScale, ModelSpec};
+    let mut spec: ModelSpec = test_depth_model().network.spec().clone();
+    let channel = |(name, unit): (&str, &str)| ChannelScale {
+        name: name.to_owned(),
+        unit: unit.to_owned(),
+        ..spec.states[0].clone()
+    };
+    spec.actions = [("linear", "m/s"), ("angular", "rad/s")].map(channel).to_vec();
     loaded(spec)
 }
 

@@ -32,4 +32,4 @@ pub use error::SimError;
 pub use robot::PlanarPose;
 pub use room_set::RoomSet;
 pub use scenario::{PidGains, Scenario, TrialParameters, TrialRoom};
-pub use world::{Observation, StepResult, World, action_channels, state_channels};
+pub use world::{Observation, StepResult, TriedStep, World, action_channels, state_channels};

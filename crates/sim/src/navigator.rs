@@ -16,6 +16,7 @@ pub(super) const ARRIVAL_M: f32 = 0.1;
 const NEXT_GOAL_M: f32 = 0.8;
 
 /// A robot's goal and its controllers.
+#[derive(Clone)]
 pub(super) struct Navigator {
     goal_m: [f32; 2],
     heading: Pid,

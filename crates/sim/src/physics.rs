@@ -64,6 +64,35 @@ impl PhysicsScene {
         }
     }
 
+    /// A second scene of the same room, in which the robots stand and move as they do now.
+    pub(super) fn branch(&self, room: &Room) -> Self {
+        let mut branch = Self::new(room);
+        for (robot, body) in self.robots.iter().enumerate() {
+            branch.add_robot(self.pose(robot), body.radius_m);
+            branch.robots[robot].drive = body.drive.clone();
+            let (moving, copy) = (&self.physics.bodies[body.handle], branch.robots[robot].handle);
+            if let Some(copy) = branch.physics.bodies.get_mut(copy) {
+                copy.set_linvel(moving.linvel(), true);
+                copy.set_angvel(moving.angvel(), true);
+            }
+        }
+        branch
+    }
+
+    /// The distance from a robot's edge to the edge of the nearest other robot, in metres; infinite without one.
+    pub(super) fn gap_to_robots_m(&self, robot: usize) -> f32 {
+        let of = |robot: usize| (super::arena::position(self.pose(robot)), self.robots[robot].radius_m);
+        let (place, radius) = of(robot);
+        let others = (0..self.robots.len()).filter(|&other| other != robot).map(of);
+        let gap = |(other, other_radius)| super::arena::distance(place, other) - radius - other_radius;
+        others.map(gap).fold(f32::INFINITY, f32::min)
+    }
+
+    /// A robot's radius, in metres.
+    pub(super) fn radius_m(&self, robot: usize) -> f32 {
+        self.robots[robot].radius_m
+    }
+
     /// Adds a robot at this pose, with its wheels at rest.
     pub(super) fn add_robot(&mut self, pose: PlanarPose, radius_m: f32) {
         let upright = LockedAxes::TRANSLATION_LOCKED_Z | LockedAxes::ROTATION_LOCKED_X | LockedAxes::ROTATION_LOCKED_Y;

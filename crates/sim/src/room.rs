@@ -209,6 +209,14 @@ impl Room {
         self.clearance(pose, radius_m, &[]) >= arena::distance(from, to)
     }
 
+    /// Distance from a point to the nearest wall or piece, in metres; 0 or less inside one.
+    pub(super) fn gap_m(&self, [x, y]: [f32; 2]) -> f32 {
+        let half = self.width_m / 2.0;
+        let walls = x.min(self.length_m - x).min(half - y.abs());
+        let pieces = self.pieces.iter().map(|piece| piece.footprint.distance([x, y]));
+        pieces.fold(walls, f32::min)
+    }
+
     /// Whether a point is at least this far from every wall and piece.
     pub(super) fn is_clear(&self, [x, y]: [f32; 2], margin_m: f32) -> bool {
         let is_inside = (margin_m..=self.length_m - margin_m).contains(&x) && y.abs() <= self.width_m / 2.0 - margin_m;

@@ -21,6 +21,12 @@ use super::scenario::{Scenario, TrialParameters};
 const PHYSICS_STEP_S: f32 = 0.02;
 /// Greatest relative error of the radius that the odometry assumes for a wheel, in rooms of their own.
 const WHEEL_ERROR: f32 = 0.02;
+/// How many places are tried as Tb1's goal.
+const GOAL_TRIES: usize = 400;
+/// The distance of a goal from what stands in the room, beside the robot's radius, in metres.
+const GOAL_MARGIN_M: f32 = 0.15;
+/// The distance of the straight way to a goal from what stands in the room, beside the robot's radius, in metres.
+const WAY_MARGIN_M: f32 = 0.08;
 /// In a scenario that does not end at a goal, a robot that touches something for this long gets a new goal, in seconds.
 const BLOCKED_LIMIT_S: f32 = 1.0;
 
@@ -73,6 +79,7 @@ pub fn state_channels() -> Vec<Channel> {
 }
 
 /// Another robot: its appearance and its controller.
+#[derive(Clone)]
 struct OtherRobot {
     appearance: &'static RobotAppearance,
     /// Added to its gray values.
@@ -110,6 +117,20 @@ pub struct World {
     observation: Observation,
     policy_action: Action,
     ended: bool,
+    /// Whether Tb1 touched something in the last step.
+    touched: bool,
+}
+
+/// What happens to Tb1 in a step that is only tried.
+#[derive(Clone, Copy, Debug, PartialEq)]
+#[doc(hidden)]
+pub struct TriedStep {
+    /// Its true pose at the end.
+    pub pose: PlanarPose,
+    /// The distance to the nearest thing, in metres.
+    pub gap_m: f32,
+    /// Whether it touched something.
+    pub touched: bool,
 }
 
 impl World {
@@ -166,6 +187,7 @@ impl World {
             observation,
             policy_action: Action::try_from(vec![0.0, 0.0])?,
             ended: false,
+            touched: false,
         };
         world.update_observation()?;
         Ok(world)
@@ -215,6 +237,61 @@ impl World {
         self.physics.pose(0)
     }
 
+    /// Whether Tb1 touched something in the last step.
+    #[must_use]
+    #[doc(hidden)]
+    pub fn has_touched(&self) -> bool {
+        self.touched
+    }
+
+    /// The distance from Tb1's edge to the nearest wall, piece or robot, in metres.
+    #[must_use]
+    #[doc(hidden)]
+    pub fn gap_m(&self) -> f32 {
+        gap_m(&self.physics, &self.room)
+    }
+
+    /// A place for Tb1 to drive to: free, at least `least_m` away, and with a straight way that nothing stands on. Of several, one
+    /// at random; `None` if there is none. Robots do not count.
+    #[must_use]
+    #[doc(hidden)]
+    pub fn draw_goal(&self, seed: Seed, least_m: f32) -> Option<[f32; 2]> {
+        let mut random = seed.rng();
+        let here = arena::position(self.physics.pose(0));
+        let radius = self.physics.radius_m(0);
+        let half = self.room.width_m / 2.0;
+        (0..GOAL_TRIES)
+            .map(|_| {
+                [
+                    random.random_range(0.0..self.room.length_m),
+                    random.random_range(-half..half),
+                ]
+            })
+            .find(|&place| {
+                arena::distance(here, place) >= least_m
+                    && self.room.is_clear(place, radius + GOAL_MARGIN_M)
+                    && self.room.is_way_free(here, place, radius + WAY_MARGIN_M)
+            })
+    }
+
+    /// What would happen to Tb1 under these commands, [m/s, rad/s], one for each frame period: the world itself stays as it is.
+    #[must_use]
+    #[doc(hidden)]
+    pub fn try_plan(&self, commands: &[[f32; 2]]) -> Vec<TriedStep> {
+        let (mut physics, mut others) = (self.physics.branch(&self.room), self.others.clone());
+        let next_goals = self.parameters.scenario.has_several_goals().then_some(&self.room);
+        let step = |&command: &[f32; 2]| {
+            physics.command(0, command);
+            let touched = advance(&mut physics, &mut others, next_goals, self.config.frame_period_s as f32);
+            TriedStep {
+                pose: physics.pose(0),
+                gap_m: gap_m(&physics, &self.room),
+                touched,
+            }
+        };
+        commands.iter().map(step).collect()
+    }
+
     /// Renders the current camera image and its segmentation mask again: the same bytes as in [`World::observe`].
     pub fn render(&self) -> Result<(Frame, Vec<u8>), SimError> {
         let robots: Vec<RenderedRobot> = self
@@ -243,7 +320,14 @@ impl World {
         if self.parameters.scenario.observer_drives() {
             self.physics.command(0, [linear, angular]);
         }
-        let touched = self.advance();
+        let next_goals = self.parameters.scenario.has_several_goals().then_some(&self.room);
+        let touched = advance(
+            &mut self.physics,
+            &mut self.others,
+            next_goals,
+            self.config.frame_period_s as f32,
+        );
+        self.touched = touched;
         self.frame_index += 1;
         self.update_observation()?;
         let tb2_arrived = self.others[0].navigator.has_arrived(self.physics.pose(1));
@@ -256,23 +340,6 @@ impl World {
             terminated,
             truncated,
         })
-    }
-
-    /// Simulates the physics for one frame period; returns true if Tb1 touched something.
-    fn advance(&mut self) -> bool {
-        let period = self.config.frame_period_s as f32;
-        let steps = (period / PHYSICS_STEP_S).ceil().max(1.0);
-        let dt = period / steps;
-        let next_goals = self.parameters.scenario.has_several_goals().then_some(&self.room);
-        let mut touched = false;
-        for _ in 0..steps as usize {
-            for (other, robot) in self.others.iter_mut().zip(1..) {
-                other.control(&mut self.physics, robot, next_goals, dt);
-            }
-            self.physics.advance(dt);
-            touched |= self.physics.is_touching(0);
-        }
-        touched
     }
 
     /// How well Tb2 is in view, 0…1: from its bearing, and 0 if none of its pixels is visible.
@@ -310,4 +377,24 @@ impl World {
         }
         Ok(())
     }
+}
+
+/// Simulates the physics for one frame period; returns true if Tb1 touched something.
+fn advance(physics: &mut PhysicsScene, others: &mut [OtherRobot], next_goals: Option<&Room>, period_s: f32) -> bool {
+    let steps = (period_s / PHYSICS_STEP_S).ceil().max(1.0);
+    let dt = period_s / steps;
+    let mut touched = false;
+    for _ in 0..steps as usize {
+        for (other, robot) in others.iter_mut().zip(1..) {
+            other.control(physics, robot, next_goals, dt);
+        }
+        physics.advance(dt);
+        touched |= physics.is_touching(0);
+    }
+    touched
+}
+
+fn gap_m(physics: &PhysicsScene, room: &Room) -> f32 {
+    let place = arena::position(physics.pose(0));
+    (room.gap_m(place) - physics.radius_m(0)).min(physics.gap_to_robots_m(0))
 }

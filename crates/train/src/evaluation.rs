@@ -9,6 +9,7 @@ pub mod bootstrap;
 mod calibrate;
 mod compatible;
 mod config;
+pub mod drive;
 mod error;
 pub mod figures;
 mod forecast;

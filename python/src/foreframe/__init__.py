@@ -12,7 +12,21 @@ from .errors import (
     StreamError,
     Unavailable,
 )
-from .records import Answer, Camera, Channel, Dataset, Job, LogLine, Model, Prediction, Rollouts, Spec
+from .records import (
+    Answer,
+    Camera,
+    Channel,
+    Dataset,
+    Goal,
+    Job,
+    LogLine,
+    Model,
+    Plan,
+    PlannedActions,
+    Prediction,
+    Rollouts,
+    Spec,
+)
 from .server import Server, serve
 from .session import AsyncSession, Session
 
@@ -28,11 +42,14 @@ __all__ = [
     "Dataset",
     "Environment",
     "ForeframeError",
+    "Goal",
     "Job",
     "JobFailed",
     "LogLine",
     "Model",
     "Observation",
+    "Plan",
+    "PlannedActions",
     "Prediction",
     "Rollouts",
     "Server",

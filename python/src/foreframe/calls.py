@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .images import FrameLike, encode_all
-from .records import Camera, Dataset, Job, LogLine, Model, Prediction, Rollouts, Spec
+from .records import Camera, Dataset, Goal, Job, LogLine, Model, Plan, Prediction, Rollouts, Spec
 
 T = TypeVar("T")
 
@@ -153,6 +153,73 @@ def session_rollouts(
     body = given(format="raw", plans=[numbers(plan) for plan in plans], state=numbers(state), steps=steps)
     read, headers = partial(Rollouts.of, size=spec.size), {"x-session-token": token}
     return Call("POST", path("sessions", session, "rollouts"), read, body, headers=headers, is_binary=True)
+
+
+def plan(
+    name: str,
+    spec: Spec,
+    frames: Sequence[FrameLike] | NDArray[np.uint8],
+    goal: Goal,
+    *,
+    state: Vector | None,
+    states: Vectors | None,
+    present: Vectors | None,
+    action: Vector | None,
+    resize: str | None,
+    camera: Camera | None,
+    search: Mapping[str, Any],
+) -> Call[Plan]:
+    image_format, images = encode_all(frames, spec.size)
+    body = given(
+        frames=images,
+        format=image_format,
+        goal=goal.body(spec.size, image_format),
+        state=numbers(state),
+        states=numbers(states),
+        present=numbers(present),
+        action=numbers(action),
+        resize=resize,
+        camera=camera and camera.body(),
+        search=_search(search),
+        with_frames=True,
+    )
+    return Call("POST", path("models", name, "plan"), partial(Plan.of, size=spec.size), body, is_binary=True)
+
+
+def session_plan(
+    session: str,
+    token: str,
+    spec: Spec,
+    goal: Goal,
+    *,
+    state: Vector | None,
+    present: Vectors | None,
+    action: Vector | None,
+    search: Mapping[str, Any],
+) -> Call[Plan]:
+    body = given(
+        format="raw",
+        goal=goal.body(spec.size, "raw"),
+        state=numbers(state),
+        present=numbers(present),
+        action=numbers(action),
+        search=_search(search),
+        with_frames=True,
+    )
+    read, headers = partial(Plan.of, size=spec.size), {"x-session-token": token}
+    return Call("POST", path("sessions", session, "plan"), read, body, headers=headers, is_binary=True)
+
+
+def _search(search: Mapping[str, Any]) -> Mapping[str, Any] | None:
+    """The settings of a search that are given, those of the solver in an object of their own."""
+    solver = {name: search[name] for name in _SOLVER if search.get(name) is not None}
+    if "solver" in search:
+        solver["kind"] = search["solver"]
+    others = {name: value for name, value in search.items() if name not in (*_SOLVER, "solver") and value is not None}
+    return given(**others, solver=solver or None) or None
+
+
+_SOLVER = ("samples", "iterations", "seed", "noise_color", "temperature")
 
 
 def create_session(model_name: str, resize: str | None, camera: Camera | None) -> Call[Mapping[str, Any]]:

@@ -20,11 +20,11 @@ from .errors import ConnectionFailed, JobFailed, api_error
 from .events import EventReader
 from .flow import follow, follow_async
 from .images import FrameLike
-from .records import Camera, Dataset, Job, LogLine, Model, Predicted, Prediction, Rollouts, Spec
+from .records import Camera, Dataset, Goal, Job, LogLine, Model, Plan, Predicted, Prediction, Rollouts, Spec
 from .session import AsyncSession, Session
 
 T = TypeVar("T")
-P = TypeVar("P", bound=Predicted)
+P = TypeVar("P", bound="Predicted | Plan")
 #: Several calls, of which one may need the answer to another.
 Flow: TypeAlias = "Generator[Call[Any], Any, T]"
 
@@ -185,6 +185,43 @@ class Client:
             steps=steps,
             resize=resize,
             camera=camera,
+        )
+        return self._follow(self._specs.predicted(model, call))
+
+    def plan(
+        self,
+        model: str,
+        frames: Sequence[FrameLike] | NDArray[np.uint8],
+        goal: Goal,
+        *,
+        state: Vector | None = None,
+        states: Vectors | None = None,
+        present: Vectors | None = None,
+        action: Vector | None = None,
+        resize: str | None = None,
+        camera: Camera | None = None,
+        **search: Any,
+    ) -> Plan:
+        """Searches for the plan that reaches ``goal`` best, from a context.
+
+        ``present``: the plan that the robot follows now, one of the candidates. ``action``: the action before the plan.
+        ``search``: what is not the default, by keyword: ``solver`` (``random-shooting``, ``cem`` or ``mppi``), ``samples``,
+        ``iterations``, ``seed``, ``budget_ms``, ``costs`` (weights by name), ``limits`` (for each action channel ``low``, ``high`` and
+        maybe ``max_change``), ``steps``, ``finalists``, ``radius_m``, ``margin_m``, ``robot_height_m``. If no plan is safe, the plan is
+        to stop, and ``safe`` is False.
+        """
+        call = partial(
+            calls.plan,
+            model,
+            frames=frames,
+            goal=goal,
+            state=state,
+            states=states,
+            present=present,
+            action=action,
+            resize=resize,
+            camera=camera,
+            search=search,
         )
         return self._follow(self._specs.predicted(model, call))
 
@@ -422,6 +459,36 @@ class AsyncClient:
             steps=steps,
             resize=resize,
             camera=camera,
+        )
+        return await self._follow(self._specs.predicted(model, call))
+
+    async def plan(
+        self,
+        model: str,
+        frames: Sequence[FrameLike] | NDArray[np.uint8],
+        goal: Goal,
+        *,
+        state: Vector | None = None,
+        states: Vectors | None = None,
+        present: Vectors | None = None,
+        action: Vector | None = None,
+        resize: str | None = None,
+        camera: Camera | None = None,
+        **search: Any,
+    ) -> Plan:
+        """As :meth:`Client.plan`."""
+        call = partial(
+            calls.plan,
+            model,
+            frames=frames,
+            goal=goal,
+            state=state,
+            states=states,
+            present=present,
+            action=action,
+            resize=resize,
+            camera=camera,
+            search=search,
         )
         return await self._follow(self._specs.predicted(model, call))
 

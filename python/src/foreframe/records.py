@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from .images import Gray, decode_all
+from .images import FrameLike, Gray, decode_all, encode
 
 P = TypeVar("P", bound="Predicted")
 
@@ -183,6 +183,100 @@ class Rollouts(Predicted):
     def best(self, cost: Callable[[Gray], float]) -> int:
         """The number of the plan with the least cost; ``cost`` takes the frames ``[steps, height, width]`` of a plan."""
         return int(np.argmin([cost(frames) for frames in self.frames]))
+
+
+@dataclass(frozen=True)
+class Goal:
+    """What a plan is to reach, as seen from the robot at the last frame. At least one part is given."""
+
+    #: Where the robot should get: metres ahead and to the left.
+    position_m: tuple[float, float] | None = None
+    #: Where it should look in the end: radians, counter-clockwise from where it looks now.
+    heading_rad: float | None = None
+    #: What its camera should show in the end: ``[height, width]`` of the model's size, or an image file if the frames are files.
+    image: FrameLike | None = None
+
+    def body(self, size: tuple[int, int], image_format: str) -> dict[str, Any]:
+        parts: dict[str, Any] = {"position_m": self.position_m, "heading_rad": self.heading_rad}
+        if self.image is not None:
+            found, parts["image"] = encode(self.image, size)
+            if found != image_format:
+                raise TypeError(f"goal.image is {found}, and the frames are {image_format}: give both as arrays, or both as files")
+        return {name: value for name, value in parts.items() if value is not None}
+
+
+@dataclass(frozen=True)
+class PlannedActions:
+    """A plan with what is expected under it."""
+
+    #: ``stop``, ``present`` or ``drawn``.
+    kind: str
+    #: ``[steps, actions]``: the first acts from the last frame on.
+    actions: Floats
+    #: The weighted sum of ``costs``, which holds their values by name, not weighted.
+    cost: float
+    costs: Mapping[str, float]
+    #: ``[steps, 3]``: metres ahead and to the left of where the robot is, and radians; empty if the actions are no speeds.
+    way: Floats
+    #: The least distance to what the last frame shows, in metres; None if that is not known, or nothing is seen.
+    clearance_m: float | None
+    #: ``[steps, height, width]``: the predicted frames; None if there was no time to predict them.
+    frames: Gray | None
+    #: ``[steps]``: mean squared error to expect of each frame; empty if it is not known.
+    expected_mse: Floats
+
+    @classmethod
+    def read(cls, body: Mapping[str, Any], image_format: str, size: tuple[int, int]) -> PlannedActions:
+        images = body.get("frames")
+        return cls(
+            kind=body["kind"],
+            actions=np.asarray(body["actions"], np.float32),
+            cost=body["cost"],
+            costs=body["costs"],
+            way=np.asarray(body.get("way", []), np.float32),
+            clearance_m=body.get("clearance_m"),
+            frames=decode_all(images, image_format, size) if images else None,
+            expected_mse=np.asarray(body.get("expected_mse", []), np.float32),
+        )
+
+
+@dataclass(frozen=True)
+class Plan(PlannedActions):
+    """The best plan, or stopping if no plan is safe."""
+
+    model: str
+    version: int
+    #: The next best plans, which differ, best first.
+    runners_up: tuple[PlannedActions, ...]
+    #: Whether the plan is safe, as far as it was checked; otherwise ``reason`` says why not.
+    safe: bool
+    reason: str | None
+    #: Whether the way was checked against what the model's depth network sees in the last frame.
+    clearance_checked: bool
+    novelty: float | None
+    #: Plans that were judged, and those whose frames were predicted.
+    samples: int
+    predicted: int
+    #: How long the search took.
+    time_ms: float
+
+    @classmethod
+    def of(cls, body: Mapping[str, Any], size: tuple[int, int]) -> Plan:
+        image_format = body["format"]
+        best = PlannedActions.read(body["plan"], image_format, size)
+        return cls(
+            **vars(best),
+            model=body["model"],
+            version=body["version"],
+            runners_up=tuple(PlannedActions.read(other, image_format, size) for other in body["runners_up"]),
+            safe=body["safe"],
+            reason=body.get("reason"),
+            clearance_checked=body["clearance_checked"],
+            novelty=body.get("novelty"),
+            samples=body["samples"],
+            predicted=body["predicted"],
+            time_ms=body["time_ms"],
+        )
 
 
 @dataclass(frozen=True)

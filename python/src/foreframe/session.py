@@ -16,7 +16,7 @@ from .calls import Call, Plans, Vector, Vectors, authorization
 from .errors import ApiError, ForeframeError, api_error
 from .flow import follow, follow_async
 from .images import FrameLike
-from .records import Answer, Camera, Rollouts, Spec
+from .records import Answer, Camera, Goal, Plan, Rollouts, Spec
 from .stream import SUBPROTOCOL, Broken, Flow, Open, Operation, Pause, Receive, Send, SessionFlow, Shut
 
 if TYPE_CHECKING:
@@ -102,6 +102,21 @@ class Session:
     def rollouts(self, plans: Plans, *, state: Vector | None = None, steps: int | None = None) -> Rollouts:
         """Predicts the frames of each of ``plans`` ``[plans, steps, action]`` from the last frame."""
         return self._run(self._flow.rollouts(plans, state, steps))
+
+    def plan(
+        self,
+        goal: Goal,
+        *,
+        state: Vector | None = None,
+        present: Vectors | None = None,
+        action: Vector | None = None,
+        **search: Any,
+    ) -> Plan:
+        """Searches for the plan that reaches ``goal`` best, from the last frame. See :meth:`Client.plan`.
+
+        ``present`` is by default the plan of the last frame.
+        """
+        return self._run(self._flow.plan(goal, state, present, action, search))
 
     def close(self) -> None:
         """Ends the session."""
@@ -195,6 +210,18 @@ class AsyncSession:
     async def rollouts(self, plans: Plans, *, state: Vector | None = None, steps: int | None = None) -> Rollouts:
         """As :meth:`Session.rollouts`."""
         return await self._run(self._flow.rollouts(plans, state, steps))
+
+    async def plan(
+        self,
+        goal: Goal,
+        *,
+        state: Vector | None = None,
+        present: Vectors | None = None,
+        action: Vector | None = None,
+        **search: Any,
+    ) -> Plan:
+        """As :meth:`Session.plan`."""
+        return await self._run(self._flow.plan(goal, state, present, action, search))
 
     async def close(self) -> None:
         """Ends the session."""

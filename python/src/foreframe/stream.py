@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Generator, Mapping
+from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass
 from typing import Any, TypeAlias, TypeVar
 from urllib.parse import quote
@@ -15,7 +15,7 @@ from . import calls
 from .calls import Call, Plans, Vector, Vectors, given, numbers
 from .errors import ApiError, ConnectionFailed, StreamClosed, StreamError, Unavailable
 from .images import FrameLike, encode
-from .records import Answer, Camera, Prediction, Rollouts, Spec
+from .records import Answer, Camera, Goal, Plan, Prediction, Rollouts, Spec
 
 T = TypeVar("T")
 
@@ -142,14 +142,24 @@ class SessionFlow:
 
     def rollouts(self, plans: Plans, state: Vector | None, steps: int | None) -> Flow[Rollouts]:
         """The Rollouts from the last frame."""
-        try:
-            return (yield from self._rolled_out(plans, state, steps))
-        except ApiError as error:
-            if error.status != 404:
-                raise
-        # The server lost the session, and the socket has not broken yet.
-        self._is_open = False
-        return (yield from self._rolled_out(plans, state, steps))
+        return self._asked(lambda spec: calls.session_rollouts(*self.identity, spec, plans, state=state, steps=steps))
+
+    def plan(
+        self,
+        goal: Goal,
+        state: Vector | None,
+        present: Vectors | None,
+        action: Vector | None,
+        search: Mapping[str, Any],
+    ) -> Flow[Plan]:
+        """The Plan from the last frame."""
+
+        def call(spec: Spec) -> Call[Plan]:
+            return calls.session_plan(
+                *self.identity, spec, goal, state=state, present=present, action=action, search=search
+            )
+
+        return self._asked(call)
 
     def close(self) -> Flow[None]:
         """Ends the session on the server, if it can be reached."""
@@ -162,10 +172,20 @@ class SessionFlow:
                 # It is gone already, or ends by itself.
                 pass
 
-    def _rolled_out(self, plans: Plans, state: Vector | None, steps: int | None) -> Flow[Rollouts]:
+    def _asked(self, call: Callable[[Spec], Call[T]]) -> Flow[T]:
+        """The answer to a request about the session, which may have been lost on the server."""
         yield from self.open()
         assert self.spec is not None
-        found: Rollouts = yield calls.session_rollouts(*self.identity, self.spec, plans, state=state, steps=steps)
+        try:
+            found: T = yield call(self.spec)
+            return found
+        except ApiError as error:
+            if error.status != 404:
+                raise
+        # The server lost the session, and the socket has not broken yet.
+        self._is_open = False
+        yield from self.open()
+        found = yield call(self.spec)
         return found
 
     def _answered(self, message: dict[str, Any]) -> Flow[Mapping[str, Any]]:

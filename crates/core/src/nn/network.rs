@@ -2,15 +2,18 @@
 
 use std::collections::BTreeMap;
 
-use candle_core::{Tensor, Var};
+use candle_core::{DType, Device, Tensor, Var};
 
 use super::conditioning::ConditioningTensors;
 use super::dense::{DenseNetwork, Feedback};
 use super::error::NnError;
 use super::flow::{FlowNetwork, FlowPrediction};
+use super::geometry::state_channels::StateChannels;
+use super::geometry::wheel_dynamics;
 use super::model_tensors::ModelTensors;
 use super::parameters::{Parameters, of_shape};
 use super::spec::{Architecture, ModelSpec, in_range};
+use super::tensors::with_values;
 
 /// A network that predicts frames. It keeps each frame as a code of [`ModelSpec::code_len`] numbers: the dense network's
 /// features, or for the flow network the frame itself. Holds weights only, so one model serves many.
@@ -157,6 +160,56 @@ impl Network {
         }
     }
 
+    /// How the robot moves under each of several plans of `steps` actions: yaw, ahead and left since the last frame, after
+    /// each action, in radians and metres; plan after plan. `actions` holds all plans' actions, in their units. By the wheels
+    /// alone, so for any number of steps. `None` if no action is a speed. Errors: `Tensor`.
+    pub fn commanded_motion(
+        &self,
+        state: &[f32],
+        actions: &[f32],
+        steps: usize,
+    ) -> Result<Option<Vec<[f32; 3]>>, NnError> {
+        let channels = StateChannels::of(&self.spec);
+        let count = self.spec.actions.len();
+        if !channels.commands_speeds() || steps == 0 {
+            return Ok(None);
+        }
+        let plans = actions.chunks_exact(steps * count);
+        debug_assert!(
+            state.len() >= self.spec.state_inputs().unwrap_or(0),
+            "a state without all its channels"
+        );
+        let speeds = plans.map(|plan| channels.speeds(state, plan, count)).collect();
+        let learned = match &self.network {
+            AnyNetwork::Dense(_) => None,
+            AnyNetwork::Flow(flow) => flow.wheels(),
+        };
+        let wheels = match learned {
+            Some(wheels) => wheels.clone(),
+            None => Tensor::zeros(2, DType::F32, &Device::Cpu)?,
+        };
+        let motions = wheel_dynamics::integral(&wheels, speeds, self.spec.frame_period_s)?;
+        let motions = with_values(&motions, |values| {
+            let parts = values.as_chunks::<3>().0;
+            parts.to_vec()
+        })?;
+        Ok(Some(motions))
+    }
+
+    /// The points that the last frame of each of B windows with `codes` [B, context, `code_len`] shows, one for each pixel: ahead,
+    /// left and up of the camera, in metres. Empty if the network estimates no depth. Errors: `Shape`, `Missing`.
+    pub fn seen_points(
+        &self,
+        codes: &Tensor,
+        conditioning: &ConditioningTensors,
+    ) -> Result<Vec<Vec<[f32; 3]>>, NnError> {
+        self.check_windows(codes)?;
+        match &self.network {
+            AnyNetwork::Dense(_) => Ok(Vec::new()),
+            AnyNetwork::Flow(flow) => flow.seen_points(codes, conditioning),
+        }
+    }
+
     /// The codes [B, context, `code_len`] again, from what the dense network's encoder kept of them; `None` for the flow
     /// network, which does not reconstruct. Errors: `Shape`.
     pub fn reconstruct(&self, codes: &Tensor) -> Result<Option<Tensor>, NnError> {
@@ -217,8 +270,6 @@ fn each_once(windows: usize) -> Vec<u32> {
 
 #[cfg(test)]
 mod tests {
-    use candle_core::Device;
-
     use super::*;
     use crate::nn::options::Conditioning;
     use crate::nn::spec::{ChannelScale, DenseSpec, FlowSpec};

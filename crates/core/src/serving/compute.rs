@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
-use candle_core::{Device, Tensor};
+use candle_core::{DType, Device, Tensor};
 
 use super::conditioning::ConditioningInput;
 use super::error::ServingError;
@@ -66,6 +66,7 @@ fn compute(loaded: &Model, tasks: &[&Task]) -> Result<Vec<Prediction>, Failure> 
             manifest: Arc::clone(&loaded.manifest),
             features,
             rollouts: Vec::new(),
+            points: Vec::new(),
             warnings: Vec::new(),
             timing: Timing::default(),
         });
@@ -73,8 +74,14 @@ fn compute(loaded: &Model, tasks: &[&Task]) -> Result<Vec<Prediction>, Failure> 
     if rows.is_empty() {
         return Ok(predictions);
     }
-    let mut rollouts = Windows::new(loaded, &windows, of_windows)?.predict(&rows)?.into_iter();
+    let windows = Windows::new(loaded, &windows, of_windows)?;
+    let mut rollouts = windows.predict(&rows)?.into_iter();
+    let mut window = 0;
     for (task, prediction) in tasks.iter().zip(&mut predictions) {
+        if task.sees_points && !task.conditioning_inputs.is_empty() {
+            prediction.points = windows.seen_points(window)?;
+        }
+        window += u32::from(!task.conditioning_inputs.is_empty());
         prediction.rollouts = rollouts.by_ref().take(task.conditioning_inputs.len()).collect();
     }
     Ok(predictions)
@@ -168,6 +175,25 @@ impl<'a> Windows<'a> {
                     .collect()
             })
         })??)
+    }
+
+    /// Where the points are that the last frame of a window shows; empty if the model estimates no depth.
+    fn seen_points(&self, window: u32) -> Result<Vec<[f32; 3]>, Failure> {
+        let spec = self.loaded.spec();
+        let inputs: Vec<&ConditioningInput> = self.tasks[window as usize].conditioning_inputs.iter().take(1).collect();
+        // The depth does not depend on the actions, but the network takes those of its whole horizon.
+        let conditioning = ConditioningTensors {
+            actions: spec
+                .action_inputs()
+                .map(|count| Tensor::zeros((1, spec.horizon, count), DType::F32, &Device::Cpu))
+                .transpose()?,
+            past_states: self.past_states(&[window])?,
+            cameras: self.cameras(&[window]),
+            ..condition(spec, &inputs, inputs[0].steps(spec))?
+        };
+        let features = self.features.narrow(0, window as usize, 1)?.contiguous()?;
+        let points = self.loaded.network.seen_points(&features, &conditioning)?;
+        Ok(points.into_iter().next().unwrap_or_default())
     }
 
     /// The earlier states of the window of each row `[N, context - 1, S]`, NaN where they are not known; `None` if no

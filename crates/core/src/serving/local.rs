@@ -6,7 +6,7 @@ use super::compute;
 use super::conditioning::{ConditioningInput, REQUEST_FIELDS, RawConditioning};
 use super::error::ServingError;
 use super::input::PredictionInput;
-use super::prediction::Rollout;
+use super::prediction::{Prediction, Rollout};
 use super::ranges::range_warnings;
 use super::session::{SessionSnapshot, SessionState, SnapshotError};
 use super::task::{Task, check_size};
@@ -23,6 +23,13 @@ pub fn predict(loaded: &Model, inputs: &[&PredictionInput]) -> Result<Vec<Rollou
         .map(|input| Ok((*input).clone().into_task(&loaded.manifest)?))
         .collect::<Result<Vec<Task>, ServingError>>()?;
     rollouts(loaded, &tasks)
+}
+
+/// Computes one task. Errors: as [`predict`].
+#[doc(hidden)]
+pub fn compute_task(loaded: &Model, task: &Task) -> Result<Prediction, ServingError> {
+    let prediction = compute::run(loaded, &[task])?.pop();
+    Ok(prediction.expect("a task without a prediction is a bug"))
 }
 
 /// The rollouts of all tasks, in order.
@@ -107,6 +114,14 @@ impl Session {
     #[must_use]
     pub fn warnings(&self) -> Vec<String> {
         range_warnings(&self.model.manifest, std::slice::from_ref(&self.state.conditioning))
+    }
+
+    /// The task whose context are the session's frames, without rollouts; `None` until the context is full.
+    #[doc(hidden)]
+    #[must_use]
+    pub fn context_task(&self) -> Option<Task> {
+        let is_full = self.state.frame_count() == self.model.spec().context;
+        is_full.then(|| self.state.rollout_task(Vec::new(), self.model.spec()))
     }
 
     /// What another program or server needs to continue the session.

@@ -190,10 +190,22 @@ impl SessionState {
         self.features.len()
     }
 
+    /// The camera, if it is another than the model's.
+    #[must_use]
+    pub fn camera(&self) -> Option<CameraModel> {
+        self.camera
+    }
+
     /// The robot's state at the last frame, if the model takes it.
     #[must_use]
     pub fn robot_state(&self) -> Option<&RobotState> {
         self.conditioning.state.as_ref()
+    }
+
+    /// The actions that the last prediction took: the plan that the robot follows now. Empty if the model takes none.
+    #[must_use]
+    pub fn present_plan(&self) -> &[Action] {
+        &self.conditioning.actions
     }
 
     /// The task for the next frame: encode it and, if it fills the context, predict under the conditioning input.
@@ -210,6 +222,7 @@ impl SessionState {
             warnings: Vec::new(),
             frames: vec![frame],
             conditioning_inputs: conditioning.filter(|_| is_full).into_iter().collect(),
+            sees_points: false,
         }
     }
 
@@ -245,6 +258,7 @@ impl SessionState {
             warnings: Vec::new(),
             frames: Vec::new(),
             conditioning_inputs,
+            sees_points: false,
         }
     }
 }

@@ -27,6 +27,8 @@ pub struct Task {
     pub(super) conditioning_inputs: Vec<ConditioningInput>,
     /// What of the input the model does not use.
     pub(super) warnings: Vec<String>,
+    /// Whether the answer tells where the points are that the last frame shows. It takes the first rollout's state.
+    pub(super) sees_points: bool,
 }
 
 impl Task {
@@ -50,6 +52,18 @@ impl Task {
         })
     }
 
+    /// The same context with other rollouts. `sees_points`: the answer tells where the points are that the last frame shows, if
+    /// the model estimates depth and there is a rollout.
+    #[doc(hidden)]
+    #[must_use]
+    pub fn with_rollouts(&self, conditioning_inputs: Vec<ConditioningInput>, sees_points: bool) -> Self {
+        Self {
+            conditioning_inputs,
+            sees_points,
+            ..self.clone()
+        }
+    }
+
     /// Splits off what is computed next: the frames, and the first rollouts up to a limit.
     pub(super) fn next_part(&mut self, limit: usize) -> Self {
         if self.conditioning_inputs.len() <= limit {
@@ -63,6 +77,7 @@ impl Task {
             frames: std::mem::take(&mut self.frames),
             conditioning_inputs: std::mem::replace(&mut self.conditioning_inputs, later),
             warnings: Vec::new(),
+            sees_points: std::mem::take(&mut self.sees_points),
         }
     }
 }

@@ -2,6 +2,7 @@
 
 pub mod animation;
 mod chart;
+pub mod fan;
 mod lettering;
 pub mod montage;
 

@@ -6,9 +6,10 @@ use candle_core::{DType, Device, Tensor};
 use super::blocks::sampled_blocks;
 use super::depth_head::{DepthHead, SeenPlaces};
 use super::depth_views::DepthViews;
-use super::network::{FlowNetwork, FlowPrediction};
+use super::network::{FlowNetwork, FlowPrediction, Surroundings};
 use super::reprojection::{Reprojection, reproject};
 use super::rollout_rows::RolloutRows;
+use crate::nn::conditioning::ConditioningTensors;
 use crate::nn::error::NnError;
 use crate::nn::ops::compose::{Composition, RoomPlaces};
 use crate::nn::ops::linear::per_place;
@@ -16,6 +17,34 @@ use crate::nn::ops::sampling::sample_features;
 use crate::nn::tensors::with_values;
 
 impl FlowNetwork {
+    /// The points that the last frames of B windows `[B, context, P]` show, one for each pixel: ahead, left and up of each
+    /// camera, in metres. Empty if this form estimates no depth. Errors: `Shape`, `Missing`.
+    pub(in crate::nn) fn seen_points(
+        &self,
+        frames: &Tensor,
+        conditioning: &ConditioningTensors,
+    ) -> Result<Vec<Vec<[f32; 3]>>, NnError> {
+        let Surroundings::Seen(head) = &self.surroundings else {
+            return Ok(Vec::new());
+        };
+        let windows: Vec<u32> = (0..frames.dim(0)? as u32).collect();
+        let rows = RolloutRows::new(&self.spec, frames, &windows, conditioning)?;
+        let contexts = rows.contexts(self.sizes.layers.frames_read);
+        let mut views = DepthViews::of(&contexts);
+        let features = self.encode(contexts.count(), std::mem::take(&mut views.inputs))?;
+        let depths = head.forward(&features, &views)?;
+        let points = with_values(&depths, |depths| {
+            let of_frames = depths.chunks_exact(self.spec.pixels()).zip(&views.viewers);
+            of_frames
+                .map(|(depths, viewer)| {
+                    let points = viewer.rays().into_iter().zip(depths);
+                    points.map(|(ray, depth)| ray.map(|part| part * depth)).collect()
+                })
+                .collect()
+        })?;
+        Ok(points)
+    }
+
     /// All steps of the rollouts at once; gives the frames of the first `steps`.
     pub(super) fn predict_with_depth(
         &self,

@@ -43,6 +43,11 @@ impl MotionHead {
         }
     }
 
+    /// What was learned of the wheels, as [`wheel_dynamics::integral`] takes it.
+    pub(super) fn wheels(&self) -> Option<&Tensor> {
+        self.wheels.as_ref()
+    }
+
     /// Whether anything says how the camera moves.
     pub(super) fn is_moving(&self) -> bool {
         self.layers.is_some()

@@ -90,6 +90,11 @@ impl FlowNetwork {
         }
     }
 
+    /// What was learned of the wheels; `None` where no speeds are commanded.
+    pub(in crate::nn) fn wheels(&self) -> Option<&Tensor> {
+        self.motion.wheels()
+    }
+
     /// Whether gradients go to the weights.
     pub(super) fn is_trained(&self) -> bool {
         self.stem.weight.track_op()

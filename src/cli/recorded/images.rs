@@ -17,7 +17,8 @@ use foreframe_core::types::ModelName;
 const ENDINGS: [&str; 3] = ["png", "jpg", "jpeg"];
 
 /// The image files of a directory.
-pub(super) struct ImagePaths {
+pub(in crate::cli) struct ImagePaths {
+    dir: PathBuf,
     paths: Vec<PathBuf>,
     resize: Option<Resize>,
     /// Whether it was said that color images are converted.
@@ -26,7 +27,7 @@ pub(super) struct ImagePaths {
 
 impl ImagePaths {
     /// Lists the images of a directory; `resize` says what to do with images of another size than the model's.
-    pub(super) fn list(dir: &Path, resize: Option<Resize>) -> Result<Self, CliError> {
+    pub(in crate::cli) fn list(dir: &Path, resize: Option<Resize>) -> Result<Self, CliError> {
         let unreadable = |error| CliError::io("read", dir, &error);
         let mut paths = std::fs::read_dir(dir)
             .map_err(unreadable)?
@@ -39,19 +40,46 @@ impl ImagePaths {
         });
         paths.sort_by(|a, b| natural_order(&file_name(a), &file_name(b)));
         Ok(Self {
+            dir: dir.to_owned(),
             paths,
             resize,
             has_reported_color: false,
         })
     }
 
-    pub(super) fn count(&self) -> usize {
+    pub(in crate::cli) fn count(&self) -> usize {
         self.paths.len()
+    }
+
+    /// The number of the last frame that the model sees: `at`, or the last image. Errors: `Usage` if there are not enough before it.
+    pub(in crate::cli) fn last_of_context(
+        &self,
+        at: Option<usize>,
+        model: &ModelName,
+        spec: &ModelSpec,
+    ) -> Result<usize, CliError> {
+        let (count, dir) = (self.count(), self.dir.display());
+        if count < spec.context {
+            return Err(CliError::Usage(format!(
+                "{dir} holds {count} PNG or JPEG frames; model {model:?} takes {}",
+                spec.context
+            )));
+        }
+        let last = at.unwrap_or(count - 1);
+        if (spec.context - 1..count).contains(&last) {
+            return Ok(last);
+        }
+        Err(CliError::Usage(format!(
+            "--at is {last}; it must be {} to {}: model {model:?} takes {} frames, and {dir} holds {count}",
+            spec.context - 1,
+            count - 1,
+            spec.context
+        )))
     }
 
     /// Reads some of the images as frames of the model's size. Errors: `Usage` for an image of another size that is not to
     /// be resized.
-    pub(super) fn read(
+    pub(in crate::cli) fn read(
         &mut self,
         range: Range<usize>,
         model: &ModelName,
@@ -61,7 +89,13 @@ impl ImagePaths {
         paths.iter().map(|path| self.read_one(path, model, spec)).collect()
     }
 
-    fn read_one(&mut self, path: &Path, model: &ModelName, spec: &ModelSpec) -> Result<Frame, CliError> {
+    /// Reads one image.
+    pub(in crate::cli) fn read_one(
+        &mut self,
+        path: &Path,
+        model: &ModelName,
+        spec: &ModelSpec,
+    ) -> Result<Frame, CliError> {
         let bytes = std::fs::read(path).map_err(|error| CliError::io("read", path, &error))?;
         let unreadable = |error| CliError::Failed(format!("{}: {}", path.display(), error_text::with_causes(&error)));
         let frame = codec::decode(&bytes).map_err(unreadable)?;

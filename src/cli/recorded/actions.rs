@@ -12,14 +12,14 @@ use foreframe_core::types::{Action, RobotState};
 /// One entry for each image of the directory.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct ActionsFile {
+pub(in crate::cli) struct ActionsFile {
     #[serde(default)]
     states: Vec<RobotState>,
     actions: Vec<Action>,
 }
 
 impl ActionsFile {
-    pub(super) fn read(path: &Path) -> Result<Self, CliError> {
+    pub(in crate::cli) fn read(path: &Path) -> Result<Self, CliError> {
         let bytes = std::fs::read(path).map_err(|error| CliError::io("read", path, &error))?;
         serde_json::from_slice(&bytes).map_err(|error| {
             CliError::Usage(format!(
@@ -31,15 +31,8 @@ impl ActionsFile {
     }
 
     /// Whether the file holds what the model takes to predict after frame `last`. Errors: `Usage` with what is missing.
-    pub(super) fn check(&self, path: &Path, last: usize, spec: &ModelSpec) -> Result<(), CliError> {
-        if spec.state_inputs().is_some() && self.states.len() <= last {
-            return Err(CliError::Usage(format!(
-                "{} holds {} states; the state at frame {last} takes {}",
-                path.display(),
-                self.states.len(),
-                last + 1
-            )));
-        }
+    pub(in crate::cli) fn check(&self, path: &Path, last: usize, spec: &ModelSpec) -> Result<(), CliError> {
+        self.check_states(path, last, spec)?;
         let needed = last + spec.horizon;
         if spec.action_inputs().is_none() || self.actions.len() >= needed {
             return Ok(());
@@ -58,9 +51,22 @@ impl ActionsFile {
         )))
     }
 
+    /// Whether the file holds the state at frame `last`, if the model takes it. Errors: `Usage`.
+    pub(in crate::cli) fn check_states(&self, path: &Path, last: usize, spec: &ModelSpec) -> Result<(), CliError> {
+        if spec.state_inputs().is_none() || self.states.len() > last {
+            return Ok(());
+        }
+        Err(CliError::Usage(format!(
+            "{} holds {} states; the state at frame {last} takes {}",
+            path.display(),
+            self.states.len(),
+            last + 1
+        )))
+    }
+
     /// Fills in the states at the context's frames, of which `last` is the last one, and the actions from it on, as far as the
     /// model takes them.
-    pub(super) fn fill_in(mut self, input: &mut PredictionInput, last: usize, spec: &ModelSpec) {
+    pub(in crate::cli) fn fill_in(mut self, input: &mut PredictionInput, last: usize, spec: &ModelSpec) {
         self.states.truncate(last + 1);
         input.state = if self.states.len() > last {
             self.states.pop()

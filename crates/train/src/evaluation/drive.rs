@@ -1,0 +1,93 @@
+//! The closed loop: robots that drive to a goal among others in the simulator, with several drivers, all in the same episodes.
+//!
+//! `error` → `settings` → `drivers` (what chooses the commands) → `episode` → `scores`.
+
+mod drivers;
+mod episode;
+mod error;
+mod scores;
+mod settings;
+
+use foreframe_core::registry::Model;
+
+pub use self::episode::EpisodeResult;
+pub use self::error::DriveError;
+pub use self::scores::{DriveScore, DriverScores};
+pub use self::settings::{DriveSettings, DriverKind};
+
+/// Drives every episode with every driver. `model`: needed by those that see or plan with one. `on_episode` is called after each
+/// episode of a driver. Errors: a driver without the model that it needs, a scenario in which Tb1 does not drive, those of the simulator
+/// and of the predictions.
+pub fn run(
+    model: Option<&Model>,
+    settings: &DriveSettings,
+    on_episode: &mut dyn FnMut(DriverKind, usize),
+) -> Result<Vec<DriverScores>, DriveError> {
+    settings.check(model)?;
+    let mut scores = Vec::new();
+    for &driver in &settings.drivers {
+        let mut results = Vec::new();
+        for episode in 0..settings.episodes {
+            results.push(episode::drive(driver, model, settings, episode)?);
+            on_episode(driver, episode);
+        }
+        scores.push(DriverScores::new(driver, results, settings.seed));
+    }
+    Ok(scores)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use foreframe_core::types::Seed;
+    use foreframe_sim::Scenario;
+
+    fn settings(drivers: &[DriverKind]) -> DriveSettings {
+        DriveSettings {
+            scenario: Scenario::MovingObserver,
+            episodes: 3,
+            seed: Seed(5),
+            drivers: drivers.to_vec(),
+            duration_s: 20.0,
+            ..DriveSettings::default()
+        }
+    }
+
+    #[test]
+    fn the_straight_driver_arrives_and_the_same_seed_gives_the_same_drive() {
+        let run = || run(None, &settings(&[DriverKind::Pid]), &mut |_, _| {}).unwrap();
+        let scores = run();
+        let results = &scores[0].episodes;
+        assert!(results.iter().any(|result| result.arrived), "{results:?}");
+        for result in results {
+            assert!(result.shortest_m >= 1.5 && result.way_m > 0.0);
+            // The robot arrives beside the goal, not on it.
+            assert!(!result.arrived || result.way_m > result.shortest_m - 0.3, "{result:?}");
+        }
+        assert_eq!(run()[0].episodes, scores[0].episodes);
+    }
+
+    #[test]
+    fn with_the_simulator_as_model_fewer_episodes_end_in_a_collision() {
+        let mut settings = settings(&[DriverKind::Pid, DriverKind::Simulator]);
+        settings.scenario = Scenario::Crowded;
+        settings.duration_s = 12.0;
+        let scores = run(None, &settings, &mut |_, _| {}).unwrap();
+        let collisions = |scores: &DriverScores| scores.episodes.iter().map(|result| result.collisions).sum::<usize>();
+        assert!(collisions(&scores[1]) <= collisions(&scores[0]), "{scores:?}");
+        let shortest = |scores: &DriverScores| scores.episodes.iter().map(|r| r.shortest_m).collect::<Vec<_>>();
+        assert_eq!(shortest(&scores[0]), shortest(&scores[1]), "the episodes are the same");
+    }
+
+    #[test]
+    fn a_driver_without_its_model_is_refused() {
+        let error = run(None, &settings(&[DriverKind::Plan]), &mut |_, _| {}).unwrap_err();
+        assert_eq!(error.to_string(), "driver plan needs a model; name one");
+        let still = DriveSettings {
+            scenario: Scenario::StaticObserver,
+            ..settings(&[DriverKind::Pid])
+        };
+        let error = run(None, &still, &mut |_, _| {}).unwrap_err();
+        assert!(error.to_string().contains("static-observer"), "{error}");
+    }
+}

@@ -1,0 +1,178 @@
+//! One episode with one driver.
+
+use std::collections::VecDeque;
+use std::time::Instant;
+
+use serde::{Deserialize, Serialize};
+
+use super::drivers::{EpisodeDriver, Situation};
+use super::error::DriveError;
+use super::settings::{DriveSettings, DriverKind};
+use foreframe_core::frame::warp::CameraModel;
+use foreframe_core::registry::Model;
+use foreframe_core::types::Action;
+use foreframe_sim::{World, WorldConfig};
+
+/// The robot has arrived at this distance from its goal, in metres.
+const ARRIVAL_M: f32 = 0.25;
+/// The goal is at least this far away, in metres.
+const LEAST_GOAL_M: f32 = 1.5;
+/// Without a model, the robot stands for this many frames, as others stand until their model's context is full.
+const CONTEXT: usize = 5;
+/// Commands below this are standing, in m/s.
+const STANDING_M_S: f32 = 0.02;
+
+/// What happened in an episode.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct EpisodeResult {
+    /// Whether the robot arrived within the time.
+    pub arrived: bool,
+    /// How often it began to touch something.
+    pub collisions: usize,
+    /// The time until it arrived, or all of it, in seconds.
+    pub time_s: f64,
+    /// The way that it drove, in metres.
+    pub way_m: f64,
+    /// The straight way, which is free but for other robots, in metres.
+    pub shortest_m: f64,
+    /// The least distance to anything, in metres; at or below 0 it touched it.
+    pub closest_m: f64,
+    /// How often it stopped before it had arrived.
+    pub stops: usize,
+    /// The time of each choice of a command, in milliseconds.
+    #[serde(skip)]
+    pub planning_ms: PlanningTimes,
+}
+
+/// Times, which differ from run to run: they do not count when results are compared.
+#[derive(Clone, Debug, Default)]
+pub struct PlanningTimes(pub Vec<f64>);
+
+impl PartialEq for PlanningTimes {
+    fn eq(&self, _other: &Self) -> bool {
+        true
+    }
+}
+
+/// An episode before its first frame.
+struct EpisodeStart {
+    world: World,
+    /// The goal, in the room.
+    goal_m: [f32; 2],
+    camera: CameraModel,
+    /// The frames that a driver waits for.
+    context: usize,
+    period_s: f32,
+}
+
+impl EpisodeStart {
+    fn new(model: Option<&Model>, settings: &DriveSettings, episode: usize) -> Result<Self, DriveError> {
+        let mut config = WorldConfig {
+            max_duration_s: settings.duration_s,
+            rooms: settings.rooms,
+            ..WorldConfig::default()
+        };
+        let mut context = CONTEXT;
+        if let Some(spec) = model.map(Model::spec) {
+            (config.frame_width_px, config.frame_height_px) = (spec.frame_width_px, spec.frame_height_px);
+            config.frame_period_s = spec.frame_period_s;
+            context = spec.context;
+        }
+        let world = World::new(settings.scenario, &config, settings.seed, episode as u64)?;
+        let seed = settings.seed.derive("goal", episode as u64);
+        let goal = world.draw_goal(seed, LEAST_GOAL_M);
+        let goal = goal.or_else(|| world.draw_goal(seed, LEAST_GOAL_M / 2.0));
+        let own = world.parameters().room.as_ref();
+        let own = own.map(|room| room.camera.model_with_height());
+        Ok(Self {
+            goal_m: goal.ok_or(DriveError::NoGoal { episode })?,
+            camera: own.unwrap_or_else(|| config.camera.model_with_height()),
+            world,
+            context,
+            period_s: config.frame_period_s as f32,
+        })
+    }
+}
+
+/// Drives an episode.
+pub(super) fn drive(
+    kind: DriverKind,
+    model: Option<&Model>,
+    settings: &DriveSettings,
+    episode: usize,
+) -> Result<EpisodeResult, DriveError> {
+    let EpisodeStart {
+        mut world,
+        goal_m: goal,
+        camera,
+        context,
+        period_s,
+    } = EpisodeStart::new(model, settings, episode)?;
+    let seeds = (settings.seed.derive("driver", episode as u64), settings.budget);
+    let mut driver = EpisodeDriver::new(kind, model, period_s, seeds);
+    let start = distance(&world, goal);
+    let mut result = EpisodeResult {
+        arrived: false,
+        collisions: 0,
+        time_s: 0.0,
+        way_m: 0.0,
+        shortest_m: f64::from(start),
+        closest_m: f64::from(world.gap_m()),
+        stops: 0,
+        planning_ms: PlanningTimes::default(),
+    };
+    let (mut frames, mut states) = (VecDeque::new(), VecDeque::new());
+    let (mut was_touching, mut was_moving) = (false, false);
+    for frame in 0.. {
+        let observation = world.observe();
+        frames.push_back(observation.frame);
+        states.push_back(observation.state);
+        if frames.len() > context {
+            frames.pop_front();
+            states.pop_front();
+        }
+        let mut command = [0.0, 0.0];
+        if frames.len() == context {
+            let now = Situation {
+                world: &world,
+                frames: &frames,
+                states: &states,
+                camera,
+                goal_m: seen_from(&world, goal),
+                frame,
+            };
+            let begun = Instant::now();
+            command = driver.command(&now)?;
+            result.planning_ms.0.push(begun.elapsed().as_secs_f64() * 1000.0);
+        }
+        let is_moving = command[0] > STANDING_M_S;
+        result.stops += usize::from(was_moving && !is_moving);
+        was_moving = is_moving;
+        let before = world.observer_pose();
+        let step = world.step(&Action::try_from(command.to_vec())?)?;
+        let after = world.observer_pose();
+        result.way_m += f64::from((after.x_m - before.x_m).hypot(after.y_m - before.y_m));
+        result.closest_m = result.closest_m.min(f64::from(world.gap_m()));
+        result.collisions += usize::from(world.has_touched() && !was_touching);
+        was_touching = world.has_touched();
+        result.time_s = step.observation.time_s;
+        result.arrived = distance(&world, goal) < ARRIVAL_M;
+        if result.arrived || step.truncated || step.terminated {
+            break;
+        }
+    }
+    Ok(result)
+}
+
+fn distance(world: &World, [x, y]: [f32; 2]) -> f32 {
+    let pose = world.observer_pose();
+    (x - pose.x_m).hypot(y - pose.y_m)
+}
+
+/// A place as seen from the robot: metres ahead and to the left.
+fn seen_from(world: &World, [x, y]: [f32; 2]) -> [f32; 2] {
+    let pose = world.observer_pose();
+    let (sin, cos) = pose.heading_rad.sin_cos();
+    let (x, y) = (x - pose.x_m, y - pose.y_m);
+    [cos * x + sin * y, cos * y - sin * x]
+}

@@ -1,0 +1,124 @@
+//! Which episodes are driven, and by whom.
+
+use std::str::FromStr;
+use std::time::Duration;
+
+use serde::{Deserialize, Serialize};
+
+use super::error::DriveError;
+use foreframe_core::registry::Model;
+use foreframe_core::types::Seed;
+use foreframe_sim::{RoomSet, Scenario, action_channels, state_channels};
+
+/// What chooses the commands.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum DriverKind {
+    /// Straight to the goal, by two PID controllers; sees nothing.
+    Pid,
+    /// As `pid`, but stands while the model's depth network sees something on its way within the next second.
+    Stop,
+    /// Follows the plan that the model finds, and plans anew at every frame.
+    Plan,
+    /// Plans with the simulator itself as the model: it knows where everything will be. The upper limit.
+    Simulator,
+}
+
+impl DriverKind {
+    /// All drivers.
+    pub const ALL: [Self; 4] = [Self::Pid, Self::Stop, Self::Plan, Self::Simulator];
+
+    /// Its name.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Pid => "pid",
+            Self::Stop => "stop",
+            Self::Plan => "plan",
+            Self::Simulator => "simulator",
+        }
+    }
+}
+
+impl FromStr for DriverKind {
+    type Err = String;
+
+    fn from_str(name: &str) -> Result<Self, String> {
+        let found = Self::ALL.into_iter().find(|driver| driver.name() == name);
+        found.ok_or_else(|| format!("there is no driver {name:?}; there are: pid, stop, plan, simulator"))
+    }
+}
+
+/// Which episodes are driven, and by whom.
+#[derive(Clone, Debug)]
+pub struct DriveSettings {
+    /// The scenario; in it, the robot with the camera must drive.
+    pub scenario: Scenario,
+    /// Each trial in a room of its own from that set; without it, all are in the same room.
+    pub rooms: Option<RoomSet>,
+    /// Number of episodes.
+    pub episodes: usize,
+    /// The seed of episodes, goals and plans.
+    pub seed: Seed,
+    /// The drivers; each drives all episodes.
+    pub drivers: Vec<DriverKind>,
+    /// Longest time of an episode, in seconds.
+    pub duration_s: f64,
+    /// Time for a plan of the driver `plan`; without it, searches are whole, and a drive can be repeated.
+    pub budget: Option<Duration>,
+}
+
+impl Default for DriveSettings {
+    fn default() -> Self {
+        Self {
+            scenario: Scenario::Crowded,
+            rooms: None,
+            episodes: 20,
+            seed: Seed(0),
+            drivers: vec![DriverKind::Pid],
+            duration_s: 20.0,
+            budget: None,
+        }
+    }
+}
+
+impl DriveSettings {
+    /// Errors: `Standing`, `NoDriver`, `NoModel`, `NoDepth`, `OtherRobot`.
+    pub(super) fn check(&self, model: Option<&Model>) -> Result<(), DriveError> {
+        if !self.scenario.observer_drives() {
+            return Err(DriveError::Standing {
+                scenario: self.scenario,
+            });
+        }
+        if self.drivers.is_empty() {
+            return Err(DriveError::NoDriver);
+        }
+        for &driver in &self.drivers {
+            if !matches!(driver, DriverKind::Stop | DriverKind::Plan) {
+                continue;
+            }
+            let Some(model) = model else {
+                return Err(DriveError::NoModel { driver: driver.name() });
+            };
+            let (spec, name) = (model.spec(), || model.manifest.name.clone());
+            let units = |channels: &[foreframe_core::nn::ChannelScale]| -> Vec<String> {
+                channels.iter().map(ToString::to_string).collect()
+            };
+            let own = |channels: Vec<foreframe_core::types::Channel>| -> Vec<String> {
+                channels.iter().map(ToString::to_string).collect()
+            };
+            let fits = spec.action_inputs().is_some() && units(&spec.actions) == own(action_channels());
+            let fits = fits && (spec.state_inputs().is_none() || units(&spec.states) == own(state_channels()));
+            if !fits {
+                return Err(DriveError::OtherRobot { model: name() });
+            }
+            if driver == DriverKind::Stop && !spec.flow().is_some_and(|flow| flow.layers.depth) {
+                return Err(DriveError::NoDepth {
+                    driver: driver.name(),
+                    model: name(),
+                });
+            }
+        }
+        Ok(())
+    }
+}

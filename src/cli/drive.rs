@@ -1,0 +1,133 @@
+//! `foreframe drive`
+
+use std::io::{IsTerminal as _, Write as _};
+use std::time::Duration;
+
+use super::error::CliError;
+use super::process::print_line;
+use super::settings::CommonArgs;
+use super::table::aligned;
+use super::workspace::Workspace;
+use foreframe_core::types::Seed;
+use foreframe_sim::{RoomSet, Scenario};
+use foreframe_train::evaluation::drive::{self, DriveScore, DriveSettings, DriverKind, DriverScores};
+
+/// Let robots drive to goals in the simulator, with several drivers in the same episodes.
+///
+/// The drivers: pid drives straight to the goal and sees nothing; stop does the same, but stands while the model's depth network sees
+/// something on its way; plan follows the plan that the model finds, anew at every frame; simulator plans with the simulator itself as
+/// the model, the upper limit. Goals can be reached on a straight line, but for the other robots. All drivers know where the
+/// goal is. The table has means over the episodes with 95 % bootstrap intervals.
+#[derive(clap::Args)]
+#[command(after_help = "Examples:
+  foreframe drive --scenario crowded --episodes 50 --driver pid,simulator
+  foreframe drive --scenario crowded --rooms varied --model rooms --driver stop,plan --json")]
+pub(super) struct DriveArgs {
+    /// The scenario: moving-observer or crowded
+    #[arg(long, default_value = "crowded")]
+    scenario: Scenario,
+    /// Each episode in a room of its own from that set: varied, new-materials or new-cameras [default: the same room]
+    #[arg(long, value_name = "SET")]
+    rooms: Option<RoomSet>,
+    /// Number of episodes
+    #[arg(long, default_value_t = 20, value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    episodes: u32,
+    /// The same seed gives the same episodes and goals
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// The drivers: pid, stop, plan, simulator
+    #[arg(long = "driver", value_delimiter = ',', required = true)]
+    drivers: Vec<DriverKind>,
+    /// For the drivers stop and plan: the directory of a model, its name, or NAME@VERSION
+    #[arg(long)]
+    model: Option<String>,
+    /// Longest time of an episode, in seconds
+    #[arg(long, value_name = "S", default_value_t = 20.0)]
+    duration: f64,
+    /// The time for each plan of the driver plan, in milliseconds; without it, searches are whole, and a drive can be repeated
+    #[arg(long, value_name = "MS", value_parser = clap::value_parser!(u64).range(1..=10_000))]
+    budget_ms: Option<u64>,
+    /// Print the scores and all episodes as JSON
+    #[arg(long)]
+    json: bool,
+    #[command(flatten)]
+    settings: CommonArgs,
+}
+
+pub(super) fn run(args: &DriveArgs) -> Result<(), CliError> {
+    let workspace = Workspace::new(args.settings.start()?);
+    let model = args
+        .model
+        .as_ref()
+        .map(|model| workspace.load_model(model))
+        .transpose()?;
+    let settings = DriveSettings {
+        scenario: args.scenario,
+        rooms: args.rooms,
+        episodes: args.episodes as usize,
+        seed: Seed(args.seed),
+        drivers: args.drivers.clone(),
+        duration_s: args.duration,
+        budget: args.budget_ms.map(Duration::from_millis),
+    };
+    let shows_progress = std::io::stderr().is_terminal();
+    let scores = drive::run(
+        model.as_ref().map(|(_, model)| model),
+        &settings,
+        &mut |driver, episode| {
+            if shows_progress {
+                // Progress that cannot be shown does not stop a drive.
+                let _ = write!(
+                    std::io::stderr(),
+                    "\r{}: {} of {}  ",
+                    driver.name(),
+                    episode + 1,
+                    args.episodes
+                );
+            }
+        },
+    );
+    if shows_progress {
+        let _ = writeln!(std::io::stderr());
+    }
+    let scores = scores?;
+    if args.json {
+        return print_line(serde_json::to_string(&scores).map_err(CliError::failed)?);
+    }
+    let header = [
+        "driver",
+        "success",
+        "collisions",
+        "time s",
+        "SPL",
+        "closest m",
+        "stops",
+        "choice ms (p50, p95)",
+    ];
+    let rows: Vec<[String; 8]> = scores.iter().map(row).collect();
+    for line in aligned(header, &rows) {
+        print_line(line)?;
+    }
+    Ok(())
+}
+
+fn row(scores: &DriverScores) -> [String; 8] {
+    let [median, late] = scores.planning_ms;
+    [
+        scores.driver.name().to_owned(),
+        text(&scores.success),
+        text(&scores.collisions),
+        text(&scores.time_s),
+        text(&scores.spl),
+        text(&scores.closest_m),
+        text(&scores.stops),
+        format!("{median:.1}, {late:.1}"),
+    ]
+}
+
+fn text(score: &DriveScore) -> String {
+    match score.interval {
+        None => format!("{:.2}", score.mean),
+        Some(interval) => format!("{:.2} ({:.2} … {:.2})", score.mean, interval.low, interval.high),
+    }
+}
