@@ -71,6 +71,7 @@ mod otlp;
 mod overload;
 #[cfg(unix)]
 mod own_data;
+mod packed_prediction;
 mod path_traversal;
 mod process;
 mod program;
