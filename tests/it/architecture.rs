@@ -14,7 +14,7 @@ const USED_IN: &[(&str, &[&str])] = &[
             "crates/train/src",
         ],
     ),
-    ("pulp", &["crates/core/src/vectorized"]),
+    ("pulp", &["crates/core/src/vectorized", "crates/core/src/nn/ops/packed"]),
     ("axum", &["src/server"]),
     ("hyper", &["src/server"]),
     ("figment", &["crates/train/src/settings"]),

@@ -72,6 +72,7 @@ mod otlp;
 mod overload;
 #[cfg(unix)]
 mod own_data;
+mod packed_prediction;
 mod path_traversal;
 mod plans;
 mod process;

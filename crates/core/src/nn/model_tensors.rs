@@ -24,6 +24,7 @@ impl ModelTensors {
             weight: self.tensor(&format!("{name}.weight")),
             bias: self.tensor(&format!("{name}.bias")),
             has_tanh: false,
+            packed: None,
         }
     }
 
@@ -33,6 +34,7 @@ impl ModelTensors {
             weight: self.tensor(&format!("{name}.weight")),
             bias: self.tensor(&format!("{name}.bias")),
             shape,
+            packed: None,
         }
     }
 }

@@ -59,6 +59,15 @@ impl Network {
         Ok(Self { spec, network })
     }
 
+    /// The same network with its weights packed as they are now, for faster predictions; it sees no update of the parameters.
+    /// Predictions differ by less than 1e-5. The dense network stays as it is. Errors: `Tensor`.
+    pub fn packed(mut self) -> Result<Self, NnError> {
+        if let AnyNetwork::Flow(flow) = &mut self.network {
+            flow.pack()?;
+        }
+        Ok(self)
+    }
+
     /// The same network with a description that may not fit it, to test failures.
     #[cfg(test)]
     pub(crate) fn with_spec(self, spec: ModelSpec) -> Self {

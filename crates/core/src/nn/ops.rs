@@ -1,9 +1,11 @@
 //! The operations that the networks are made of, each with its gradient. They know no model.
 
+pub(super) mod activated_convolution;
 pub(super) mod activation;
 pub(super) mod compose;
 pub(super) mod convolution;
 pub(super) mod linear;
 pub(super) mod modulation;
+pub(super) mod packed;
 pub(super) mod pixel_shuffle;
 pub(super) mod sampling;

@@ -51,7 +51,8 @@ pub struct StoredWeights {
 /// `Weights`.
 pub fn load(model_dir: &Path) -> Result<Model, RegistryError> {
     let StoredWeights { manifest, parameters } = load_weights(model_dir)?;
-    let network = Network::detached(manifest.spec.clone(), &parameters).map_err(|source| RegistryError::Weights {
+    let network = Network::detached(manifest.spec.clone(), &parameters).and_then(Network::packed);
+    let network = network.map_err(|source| RegistryError::Weights {
         path: model_dir.join(WEIGHTS_FILE),
         source,
     })?;

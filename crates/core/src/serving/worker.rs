@@ -1,4 +1,4 @@
-//! The inference thread: the only thread that computes with the models.
+//! The inference thread: the only thread that computes with the models, with helpers for a batch of many rollouts.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
@@ -23,9 +23,10 @@ pub(super) fn spawn(queue: Arc<Queue>, catalog: Arc<Catalog>) -> Result<JoinHand
     std::thread::Builder::new()
         .name("inference".to_owned())
         .spawn(move || {
-            // A pool with this thread only, so that predictions do not wait for training threads.
+            // A pool of its own, so that predictions do not wait for training threads: this thread, and one for each
+            // other core, which share the work of a batch.
             let pool = rayon::ThreadPoolBuilder::new()
-                .num_threads(1)
+                .thread_name(|index| format!("inference-{index}"))
                 .use_current_thread()
                 .build();
             match pool {

@@ -47,6 +47,7 @@ impl DenseNetwork {
         Self {
             frame_encoder: Linear {
                 has_tanh: true,
+                packed: None,
                 ..tensors.linear("frame_encoder")
             },
             frame_decoder: tensors.linear("frame_decoder"),

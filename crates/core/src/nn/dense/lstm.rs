@@ -27,6 +27,7 @@ fn input_projection(cell: &PeepholeCell, x: &Tensor, first_row: usize) -> Result
         weight: cell.w_x.narrow(0, first_row, x.dim(2)?)?,
         bias: cell.bias.clone(),
         has_tanh: false,
+        packed: None,
     };
     Ok(layer.forward(&rows)?)
 }

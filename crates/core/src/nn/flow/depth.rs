@@ -16,6 +16,15 @@ use crate::nn::ops::linear::per_place;
 use crate::nn::ops::sampling::sample_features;
 use crate::nn::tensors::with_values;
 
+/// What the network sees of contexts, for all rollouts that follow them.
+pub(super) struct SeenDepths {
+    views: DepthViews,
+    /// The encoder's features.
+    coarse: Tensor,
+    /// Of each pixel of the last frames `[contexts, P]`, in metres.
+    depths: Tensor,
+}
+
 impl FlowNetwork {
     /// The points that the last frames of B windows `[B, context, P]` show, one for each pixel: ahead, left and up of each
     /// camera, in metres. Empty if this form estimates no depth. Errors: `Shape`, `Missing`.
@@ -29,10 +38,7 @@ impl FlowNetwork {
         };
         let windows: Vec<u32> = (0..frames.dim(0)? as u32).collect();
         let rows = RolloutRows::new(&self.spec, frames, &windows, conditioning)?;
-        let contexts = rows.contexts(self.sizes.layers.frames_read);
-        let mut views = DepthViews::of(&contexts);
-        let features = self.encode(contexts.count(), std::mem::take(&mut views.inputs))?;
-        let depths = head.forward(&features, &views)?;
+        let SeenDepths { views, depths, .. } = self.see_depth(&rows, head)?;
         let points = with_values(&depths, |depths| {
             let of_frames = depths.chunks_exact(self.spec.pixels()).zip(&views.viewers);
             of_frames
@@ -45,23 +51,29 @@ impl FlowNetwork {
         Ok(points)
     }
 
+    /// Encodes the contexts of the rollouts and estimates their depths.
+    pub(super) fn see_depth(&self, rows: &RolloutRows, head: &DepthHead) -> Result<SeenDepths, NnError> {
+        let contexts = rows.contexts(self.sizes.layers.frames_read);
+        let mut views = DepthViews::of(&contexts);
+        let features = self.encode(contexts.count(), std::mem::take(&mut views.inputs))?;
+        let depths = head.forward(&features, &views)?;
+        let [coarse, _] = features;
+        Ok(SeenDepths { views, coarse, depths })
+    }
+
     /// All steps of the rollouts at once; gives the frames of the first `steps`.
     pub(super) fn predict_with_depth(
         &self,
         rows: &RolloutRows,
         steps: usize,
-        head: &DepthHead,
+        SeenDepths { views, coarse, depths }: &SeenDepths,
     ) -> Result<FlowPrediction, NnError> {
         let (size, horizon) = (self.spec.image_size(), self.spec.horizon);
         let motion = self.motion.forward(rows)?;
-        let contexts = rows.contexts(self.sizes.layers.frames_read);
-        let mut views = DepthViews::of(&contexts);
-        let features = self.encode(contexts.count(), std::mem::take(&mut views.inputs))?;
-        let depths = head.forward(&features, &views)?;
 
         // Frames that are not asked for are not computed.
         let of_steps = |&context: &u32| std::iter::repeat_n(context, steps);
-        let context_of: Vec<u32> = contexts.row_of.iter().flat_map(of_steps).collect();
+        let context_of: Vec<u32> = rows.context_of().iter().flat_map(of_steps).collect();
         let asked = |per_step: &Tensor| -> Result<Tensor, NnError> {
             let per_step = per_step.reshape((rows.count(), horizon, ()))?;
             Ok(per_step.narrow(1, 0, steps)?.flatten(0, 1)?)
@@ -71,20 +83,20 @@ impl FlowNetwork {
             viewers: views.viewers.clone(),
             context_of: context_of.clone(),
         };
-        let places = reproject(reprojection, &depths, &asked(&motion)?)?;
+        let places = reproject(reprojection, depths, &asked(&motion)?)?;
         let seen = with_values(&places, |places| SeenPlaces::of(places, size))?;
-        let warped = sample_features(&features[0], seen.coarse.clone(), &context_of)?;
-        let mixed = Tensor::cat(&[&warped, &seen.beside_features(&views, &context_of, size)?], 3)?;
+        let warped = sample_features(coarse, seen.coarse.clone(), &context_of)?;
+        let mixed = Tensor::cat(&[&warped, &seen.beside_features(views, &context_of, size)?], 3)?;
         let state = per_place(&self.mix, &mixed)?;
         let state = self.refined(state, &asked(&self.modulate(rows, &motion)?)?)?;
         let moved = sampled_blocks(&views.frames, &context_of, &seen.room, size)?;
-        let head = self.head(&state, &moved, &seen.beside_pixels(&views, &context_of, size)?)?;
+        let head = self.head(&state, &moved, &seen.beside_pixels(views, &context_of, size)?)?;
 
         let half = size.shrunk(2);
         let no_content = Tensor::zeros((context_of.len(), half.height, half.width, 4), DType::F32, &Device::Cpu)?;
         let composition = Composition {
             size,
-            frames: views.frames,
+            frames: views.frames.clone(),
             frame_of: context_of.clone(),
             room: RoomPlaces::Tracked,
         };

@@ -1,13 +1,13 @@
 //! The layers that estimate depth, and what the decoder reads beside what was moved by it.
 
 use candle_core::{Device, Tensor};
-use candle_nn::Module as _;
 
 use super::blocks::coarse_places;
 use super::depth_views::{DepthViews, KNOWN_VALUES};
 use super::reprojection::PLACE_VALUES;
 use crate::nn::error::NnError;
 use crate::nn::model_tensors::ModelTensors;
+use crate::nn::ops::activated_convolution::{Activation, activated_convolution};
 use crate::nn::ops::convolution::{ConvShape, Convolution3};
 use crate::nn::ops::linear::{Linear, per_place};
 use crate::nn::ops::modulation::silu;
@@ -44,10 +44,21 @@ impl DepthHead {
         }
     }
 
+    /// Packs the layers' weights for prediction.
+    pub(super) fn pack(&mut self) -> Result<(), NnError> {
+        self.enlarge.pack()?;
+        Ok(self.output.pack()?)
+    }
+
     /// The depth of each pixel of the last frames `[contexts, P]`, in metres.
     pub(super) fn forward(&self, [coarse, first]: &[Tensor; 2], views: &DepthViews) -> Result<Tensor, NnError> {
         let enlarged = silu(&pixel_shuffle(&per_place(&self.enlarge, &silu(coarse)?)?)?)?;
-        let logarithm = self.output.forward(&Tensor::cat(&[&enlarged, first], 3)?)?;
+        let logarithm = activated_convolution(
+            &self.output,
+            &Tensor::cat(&[&enlarged, first], 3)?,
+            Activation::None,
+            None,
+        )?;
         let logarithm = pixel_shuffle(&logarithm)?.flatten_from(1)?;
         let factor = (logarithm.tanh()? * MAX_LOGARITHM)?.exp()?;
         let before = Tensor::from_slice(&views.depths, factor.dims(), &Device::Cpu)?;

@@ -14,21 +14,37 @@ use crate::nn::ops::pixel_shuffle::pixel_unshuffle;
 use crate::nn::ops::sampling::{own_places, sample_features};
 use crate::nn::tensors::with_values;
 
+/// What the network sees of contexts, for all rollouts that follow them.
+pub(super) struct SeenContexts {
+    /// The encoder's features.
+    coarse: Tensor,
+    /// The last frames `[contexts, P]`.
+    last_frames: Vec<f32>,
+}
+
 impl FlowNetwork {
+    /// Encodes the contexts of the rollouts.
+    pub(super) fn see(&self, rows: &RolloutRows, scene: &Scene) -> Result<SeenContexts, NnError> {
+        let contexts = rows.contexts(self.sizes.layers.frames_read);
+        let inputs = contexts.inputs(self.sizes.camera, &scene.content_now(&contexts)?);
+        let [coarse, _] = self.encode(contexts.count(), inputs)?;
+        Ok(SeenContexts {
+            coarse,
+            last_frames: contexts.last_frames,
+        })
+    }
+
     /// All steps of the rollouts at once; gives the frames of the first `steps`.
     pub(super) fn predict_directly(
         &self,
         rows: &RolloutRows,
         steps: usize,
         scene: &Scene,
+        seen: &SeenContexts,
     ) -> Result<FlowPrediction, NnError> {
         let size = self.spec.image_size();
         let shape = (rows.count(), self.spec.horizon, size.pixels());
         let motion = self.motion.forward(rows)?;
-        let contexts = rows.contexts(self.sizes.layers.frames_read);
-        let inputs = contexts.inputs(self.sizes.camera, &scene.content_now(&contexts)?);
-        let [coarse, _] = self.encode(contexts.count(), inputs)?;
-
         let before = rows.poses_before();
         let poses: Vec<CameraPose> = with_values(&motion, |motions| {
             let motions = motions.as_chunks::<3>().0;
@@ -41,9 +57,9 @@ impl FlowNetwork {
         let geometry = self.places(&motion.flatten(0, 1)?, &poses, &before, scene)?;
         let scene = scene.forward(rows, &motion, &poses)?;
         let of_steps = |&context: &u32| std::iter::repeat_n(context, self.spec.horizon);
-        let context_of: Vec<u32> = contexts.row_of.iter().flat_map(of_steps).collect();
-        let warped = sample_features(&coarse, geometry.coarse, &context_of)?;
-        let blocks_at = |places: &[f32]| sampled_blocks(&contexts.last_frames, &context_of, places, size);
+        let context_of: Vec<u32> = rows.context_of().iter().flat_map(of_steps).collect();
+        let warped = sample_features(&seen.coarse, geometry.coarse, &context_of)?;
+        let blocks_at = |places: &[f32]| sampled_blocks(&seen.last_frames, &context_of, places, size);
         let moved = match &geometry.room {
             Some(places) => blocks_at(places)?,
             None => with_values(&geometry.turned, blocks_at)??,
@@ -56,7 +72,7 @@ impl FlowNetwork {
 
         let composition = Composition {
             size,
-            frames: contexts.last_frames,
+            frames: seen.last_frames.clone(),
             frame_of: context_of,
             room: geometry.room.map_or(RoomPlaces::Turned, RoomPlaces::Known),
         };

@@ -10,8 +10,6 @@ use crate::nn::spec::ModelSpec;
 /// The contexts that are encoded, each once.
 pub(super) struct EncoderViews<'a> {
     pub(super) spec: &'a ModelSpec,
-    /// The context of each rollout.
-    pub(super) row_of: Vec<u32>,
     /// How many frames are read of each.
     pub(super) frames_read: usize,
     /// The last frame of each `[contexts, P]`.

@@ -48,6 +48,14 @@ impl MotionHead {
         self.wheels.as_ref()
     }
 
+    /// Packs the layers' weights for prediction.
+    pub(super) fn pack(&mut self) -> Result<(), NnError> {
+        for layer in self.layers.iter_mut().flatten().chain(&mut self.affine) {
+            layer.pack()?;
+        }
+        Ok(())
+    }
+
     /// Whether anything says how the camera moves.
     pub(super) fn is_moving(&self) -> bool {
         self.layers.is_some()

@@ -1,7 +1,6 @@
 //! The layers of the flow network, and the parts of a prediction that both of its forms share.
 
 use candle_core::{Device, Tensor};
-use candle_nn::Module as _;
 
 use super::depth_head::DepthHead;
 use super::layers::mix_name;
@@ -10,9 +9,10 @@ use super::rollout_rows::RolloutRows;
 use super::scene::Scene;
 use crate::nn::error::NnError;
 use crate::nn::model_tensors::ModelTensors;
+use crate::nn::ops::activated_convolution::{Activation, activated_convolution};
 use crate::nn::ops::convolution::{ConvShape, Convolution3};
 use crate::nn::ops::linear::{Linear, per_place};
-use crate::nn::ops::modulation::{modulated_silu, perceptron, silu};
+use crate::nn::ops::modulation::{perceptron, silu};
 use crate::nn::ops::pixel_shuffle::pixel_shuffle;
 use crate::nn::spec::{FlowSpec, ModelSpec};
 
@@ -95,6 +95,23 @@ impl FlowNetwork {
         self.motion.wheels()
     }
 
+    /// Packs the weights of all layers as they are now, for fast prediction.
+    pub(in crate::nn) fn pack(&mut self) -> Result<(), NnError> {
+        let convolutions = [&mut self.stem, &mut self.halving, &mut self.fine, &mut self.head].into_iter();
+        let blocks = self.blocks.iter_mut().chain(&mut self.refine).flatten();
+        for convolution in convolutions.chain(blocks) {
+            convolution.pack()?;
+        }
+        for linear in self.modulation.iter_mut().chain([&mut self.mix, &mut self.enlarge]) {
+            linear.pack()?;
+        }
+        self.motion.pack()?;
+        match &mut self.surroundings {
+            Surroundings::Remembered(scene) => scene.pack(),
+            Surroundings::Seen(depth) => depth.pack(),
+        }
+    }
+
     /// Whether gradients go to the weights.
     pub(super) fn is_trained(&self) -> bool {
         self.stem.weight.track_op()
@@ -105,9 +122,8 @@ impl FlowNetwork {
         let channels = self.sizes.layers.channels;
         for (index, [first, second]) in self.refine.iter().enumerate() {
             let modulation = |part: usize| modulation.narrow(1, (2 * index + part) * 2 * channels, 2 * channels);
-            let inner = first.forward(&modulated_silu(&state, &modulation(0)?)?)?;
-            let inner = second.forward(&modulated_silu(&inner, &modulation(1)?)?)?;
-            state = (state + inner)?;
+            let inner = activated_convolution(first, &state, Activation::Modulated(&modulation(0)?), None)?;
+            state = activated_convolution(second, &inner, Activation::Modulated(&modulation(1)?), Some(&state))?;
         }
         Ok(state)
     }
@@ -116,7 +132,8 @@ impl FlowNetwork {
     pub(super) fn head(&self, state: &Tensor, moved: &Tensor, scene: &Tensor) -> Result<Tensor, NnError> {
         let enlarged = pixel_shuffle(&per_place(&self.enlarge, &silu(state)?)?)?;
         let inputs = Tensor::cat(&[&enlarged, moved, scene], 3)?;
-        Ok(self.head.forward(&silu(&self.fine.forward(&inputs)?)?)?)
+        let fine = activated_convolution(&self.fine, &inputs, Activation::None, None)?;
+        Ok(activated_convolution(&self.head, &fine, Activation::Silu, None)?)
     }
 
     /// Features of each context `[contexts, H/4, W/4, C]` and those of the first layer `[contexts, H/2, W/2, …]`, from the
@@ -124,11 +141,11 @@ impl FlowNetwork {
     pub(super) fn encode(&self, contexts: usize, inputs: Vec<f32>) -> Result<[Tensor; 2], NnError> {
         let half = self.spec.image_size().shrunk(2);
         let inputs = Tensor::from_vec(inputs, (contexts, half.height, half.width, ()), &Device::Cpu)?;
-        let first = silu(&self.stem.forward(&inputs)?)?;
-        let mut coarse = self.halving.forward(&first)?;
+        let first = silu(&activated_convolution(&self.stem, &inputs, Activation::None, None)?)?;
+        let mut coarse = activated_convolution(&self.halving, &first, Activation::None, None)?;
         for [first, second] in &self.blocks {
-            let inner = second.forward(&silu(&first.forward(&silu(&coarse)?)?)?)?;
-            coarse = (coarse + inner)?;
+            let inner = activated_convolution(first, &coarse, Activation::Silu, None)?;
+            coarse = activated_convolution(second, &inner, Activation::Silu, Some(&coarse))?;
         }
         Ok([coarse, first])
     }

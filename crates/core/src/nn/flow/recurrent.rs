@@ -33,7 +33,8 @@ impl FlowNetwork {
         let inputs = contexts.inputs(self.sizes.camera, &scene.content_now(&contexts)?);
         let [coarse, _] = self.encode(contexts.count(), inputs)?;
         let own_coarse = own_places(size.shrunk(4)).repeat(count);
-        let mut state = sample_features(&coarse, own_coarse, &contexts.row_of)?;
+        let context_of = rows.context_of();
+        let mut state = sample_features(&coarse, own_coarse, &context_of)?;
 
         let poses = vec![CameraPose::default(); count];
         let scene = scene.forward(rows, &motion, &poses)?;
@@ -43,8 +44,8 @@ impl FlowNetwork {
         let places = Tensor::from_slice(&own, (count, size.pixels(), 2), &Device::Cpu)?;
         let each: Vec<u32> = (0..count as u32).collect();
         let mut last_frames = Vec::with_capacity(count * size.pixels());
-        for &row in &contexts.row_of {
-            last_frames.extend_from_slice(&contexts.last_frames[row as usize * size.pixels()..][..size.pixels()]);
+        for &context in &context_of {
+            last_frames.extend_from_slice(&contexts.last_frames[context as usize * size.pixels()..][..size.pixels()]);
         }
         let mut frames = Vec::with_capacity(steps);
         for step in 0..steps {

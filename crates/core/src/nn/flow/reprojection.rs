@@ -10,7 +10,7 @@ use candle_core::{Result, Shape, Tensor, bail};
 use crate::frame::warp::MIN_DEPTH;
 use crate::nn::fused::{FusedOperation, Operand, apply};
 use crate::nn::geometry::camera::{Viewer, rotated};
-use crate::nn::ops::sampling::{ImageSize, Neighbourhood};
+use crate::nn::ops::sampling::{ImageSize, Neighbourhood, OfPlaces, SAMPLED_TOGETHER};
 use crate::vectorized::vectorized;
 
 /// Values of a pixel: its place before the turn, its place before turn and drive (columns and rows), its depth in metres.
@@ -69,6 +69,19 @@ impl Motion {
     }
 }
 
+impl Motion {
+    /// As [`Motion::point`], of several pixels.
+    #[inline(always)]
+    fn points(self, directions: &[OfPlaces; 3], depths: &OfPlaces) -> [OfPlaces; 3] {
+        let mut points = [[0.0; SAMPLED_TOGETHER]; 3];
+        for at in 0..SAMPLED_TOGETHER {
+            let direction = [directions[0][at], directions[1][at], directions[2][at]];
+            [points[0][at], points[1][at], points[2][at]] = self.point(direction, depths[at]);
+        }
+        points
+    }
+}
+
 /// A pixel's depth after the last correction, and the pixels of the old view around where it was seen.
 struct Found {
     depth: f32,
@@ -91,6 +104,48 @@ fn found(viewer: Viewer, size: ImageSize, depths: &[f32], motion: Motion, direct
         found.depth *= factor.clamp(CORRECTION[0], CORRECTION[1]);
     }
     found
+}
+
+/// Of several pixels: place before the turn, place before turn and drive, depth. The same arithmetic as [`found`].
+#[inline(always)]
+fn found_together(
+    viewer: Viewer,
+    size: ImageSize,
+    depths: &[f32],
+    motion: Motion,
+    rays: &[[f32; 3]],
+) -> [OfPlaces; PLACE_VALUES] {
+    let mut directions = [[0.0; SAMPLED_TOGETHER]; 3];
+    for (at, &[ahead, left, up]) in rays.iter().enumerate() {
+        [directions[0][at], directions[1][at], directions[2][at]] = [ahead, left, up];
+    }
+    for at in 0..SAMPLED_TOGETHER {
+        let ray = [directions[0][at], directions[1][at], directions[2][at]];
+        [directions[0][at], directions[1][at], directions[2][at]] = rotated(ray, motion.sin, motion.cos);
+    }
+    let turned = projected(viewer, &directions);
+    let mut found = size.sample(depths, &turned);
+    for _ in 0..ROUNDS {
+        let points = motion.points(&directions, &found);
+        let seen = size.sample(depths, &projected(viewer, &points));
+        for at in 0..SAMPLED_TOGETHER {
+            let depth = viewer.depth([points[0][at], points[1][at], points[2][at]]);
+            let factor = seen[at] / depth.max(MIN_DEPTH);
+            found[at] *= factor.clamp(CORRECTION[0], CORRECTION[1]);
+        }
+    }
+    let [x, y] = projected(viewer, &motion.points(&directions, &found));
+    [turned[0], turned[1], x, y, found]
+}
+
+/// The places of points.
+#[inline(always)]
+fn projected(viewer: Viewer, points: &[OfPlaces; 3]) -> [OfPlaces; 2] {
+    let mut places = [[0.0; SAMPLED_TOGETHER]; 2];
+    for at in 0..SAMPLED_TOGETHER {
+        [places[0][at], places[1][at]] = viewer.project([points[0][at], points[1][at], points[2][at]]);
+    }
+    places
 }
 
 impl Reprojection {
@@ -128,12 +183,14 @@ impl FusedOperation<2> for Reprojection {
             vectorized(
                 #[inline(always)]
                 || {
-                    for (out, &ray) in out.chunks_exact_mut(PLACE_VALUES).zip(&rays[context]) {
-                        let direction = rotated(ray, motion.sin, motion.cos);
-                        let found = found(viewer, self.size, depths, motion, direction);
-                        out[..2].copy_from_slice(&viewer.project(direction));
-                        out[2..4].copy_from_slice(&viewer.project(motion.point(direction, found.depth)));
-                        out[4] = found.depth;
+                    let outs = out.chunks_mut(SAMPLED_TOGETHER * PLACE_VALUES);
+                    for (out, rays) in outs.zip(rays[context].chunks(SAMPLED_TOGETHER)) {
+                        let found = found_together(viewer, self.size, depths, motion, rays);
+                        for (at, out) in out.chunks_exact_mut(PLACE_VALUES).enumerate() {
+                            for (out, found) in out.iter_mut().zip(&found) {
+                                *out = found[at];
+                            }
+                        }
                     }
                 },
             );

@@ -178,13 +178,32 @@ impl<'a> RolloutRows<'a> {
             && self.cameras.get(row) == self.cameras.get(other)
     }
 
+    /// The rollouts in parts that each follow one context.
+    pub(super) fn of_one_context(&self) -> Vec<Range<usize>> {
+        let mut parts: Vec<Range<usize>> = Vec::new();
+        for row in 0..self.count() {
+            match parts.last_mut() {
+                Some(part) if self.is_same_context(row, row - 1) => part.end = row + 1,
+                _ => parts.push(row..row + 1),
+            }
+        }
+        parts
+    }
+
+    /// The context of each rollout.
+    pub(super) fn context_of(&self) -> Vec<u32> {
+        let parts = self.of_one_context().into_iter().zip(0..);
+        parts
+            .flat_map(|(part, context)| std::iter::repeat_n(context, part.len()))
+            .collect()
+    }
+
     /// The contexts that the rollouts follow, with the last `frames_read` frames of each. Rollouts of one window and state
     /// share one.
     pub(super) fn contexts(&self, frames_read: usize) -> EncoderViews<'a> {
         let (pixels, context) = (self.spec.pixels(), self.spec.context);
         let mut views = EncoderViews {
             spec: self.spec,
-            row_of: Vec::new(),
             frames_read,
             last_frames: Vec::new(),
             earlier: Vec::new(),
@@ -193,24 +212,21 @@ impl<'a> RolloutRows<'a> {
             motions_back: Vec::new(),
             cameras: Vec::new(),
         };
-        for row in 0..self.count() {
-            if row == 0 || !self.is_same_context(row, row - 1) {
-                let frame = |back: usize| {
-                    let place = self.windows[row] as usize * context + (context - 1).saturating_sub(back);
-                    &self.frames[place * pixels..(place + 1) * pixels]
-                };
-                views.last_frames.extend_from_slice(frame(0));
-                for back in 1..frames_read {
-                    views.earlier.extend_from_slice(frame(back));
-                }
-                views.states.push(self.state(row).to_vec());
-                views.poses.push(self.pose(row));
-                views
-                    .motions_back
-                    .extend((1..frames_read).map(|back| self.motion_back(row, back)));
-                views.cameras.push(self.camera(row));
+        for Range { start: row, .. } in self.of_one_context() {
+            let frame = |back: usize| {
+                let place = self.windows[row] as usize * context + (context - 1).saturating_sub(back);
+                &self.frames[place * pixels..(place + 1) * pixels]
+            };
+            views.last_frames.extend_from_slice(frame(0));
+            for back in 1..frames_read {
+                views.earlier.extend_from_slice(frame(back));
             }
-            views.row_of.push(views.poses.len() as u32 - 1);
+            views.states.push(self.state(row).to_vec());
+            views.poses.push(self.pose(row));
+            views
+                .motions_back
+                .extend((1..frames_read).map(|back| self.motion_back(row, back)));
+            views.cameras.push(self.camera(row));
         }
         views
     }

@@ -106,6 +106,14 @@ impl Scene {
         }
     }
 
+    /// Packs the layers' weights for prediction.
+    pub(super) fn pack(&mut self) -> Result<(), NnError> {
+        for layer in &mut self.layers {
+            layer.pack()?;
+        }
+        Ok(())
+    }
+
     /// The scene at each item, `[M, H/2, W/2, SCENE_CHANNELS]`.
     pub(super) fn forward(&self, rows: &RolloutRows, motion: &Tensor, poses: &[CameraPose]) -> Result<Tensor, NnError> {
         let scaled: Vec<Vec<f32>> = (0..rows.count())

@@ -6,7 +6,7 @@
 use candle_core::{Result, Shape, Tensor, bail};
 
 use super::activation::exp;
-use super::sampling::{ImageSize, Neighbourhood};
+use super::sampling::{ImageSize, Neighbourhood, SAMPLED_TOGETHER};
 use crate::nn::fused::{FusedOperation, Operand, apply};
 use crate::vectorized::vectorized;
 
@@ -97,6 +97,58 @@ impl Composition {
         }
     }
 
+    /// Writes some neighbouring pixels of a row (counted over all items) from a column on. The same arithmetic as
+    /// [`Composition::parts`] and [`PixelParts::mixed`].
+    #[inline(always)]
+    fn mix(&self, [heads, scene, places]: [Operand; 3], [row, column]: [usize; 2], out: &mut [f32]) {
+        let ImageSize { height, width } = self.size;
+        let (scene_channels, place_values) = (last_side(scene), last_side(places));
+        let from = self.frame_of[row / height] as usize * self.size.pixels();
+        let frame = &self.frames[from..from + self.size.pixels()];
+        let mut head = [[0.0; SAMPLED_TOGETHER]; HEAD_VALUES];
+        let mut content = [0.0; SAMPLED_TOGETHER];
+        let [mut turned, mut room] = [[[0.0; SAMPLED_TOGETHER]; 2]; 2];
+        for at in 0..out.len() {
+            let (column, pixel) = (column + at, row * width + column + at);
+            let block = row / 2 * (width / 2) + column / 2;
+            let part = row % 2 * 2 + column % 2;
+            let values = &heads.values[(block * 4 + part) * HEAD_VALUES..][..HEAD_VALUES];
+            for (head, value) in head.iter_mut().zip(values) {
+                head[at] = *value;
+            }
+            content[at] = scene.values[(block + 1) * scene_channels - 4 + part];
+            let place = &places.values[pixel * place_values..][..place_values];
+            [turned[0][at], turned[1][at]] = [place[0], place[1]];
+            [room[0][at], room[1][at]] = match &self.room {
+                RoomPlaces::Turned => [place[0], place[1]],
+                RoomPlaces::Known(room) => [room[2 * pixel], room[2 * pixel + 1]],
+                RoomPlaces::Tracked => [place[2], place[3]],
+            };
+        }
+        let [mut first, mut second] = [[[0.0; SAMPLED_TOGETHER]; 2]; 2];
+        for axis in 0..2 {
+            for at in 0..SAMPLED_TOGETHER {
+                first[axis][at] = room[axis][at] + FLOW_PX * head[axis][at];
+                second[axis][at] = turned[axis][at] + FLOW_PX * head[2 + axis][at];
+            }
+        }
+        let (first, second) = (self.size.sample(frame, &first), self.size.sample(frame, &second));
+        let mut mixed = [0.0; SAMPLED_TOGETHER];
+        for at in 0..SAMPLED_TOGETHER {
+            let logits = [
+                head[4][at] + ROOM_LOGIT - self.outside([room[0][at], room[1][at]]),
+                head[5][at] - self.outside([turned[0][at], turned[1][at]]),
+                head[6][at],
+            ];
+            let most = logits[0].max(logits[1]).max(logits[2]);
+            let shares = [exp(logits[0] - most), exp(logits[1] - most), exp(logits[2] - most)];
+            let sum = shares[0] + shares[1] + shares[2];
+            let content = content[at] + head[7][at];
+            mixed[at] = first[at] * (shares[0] / sum) + second[at] * (shares[1] / sum) + content * (shares[2] / sum);
+        }
+        out.copy_from_slice(&mixed[..out.len()]);
+    }
+
     /// The parts of a pixel from its head values, content and places.
     #[inline(always)]
     fn parts(&self, head: &[f32], content: f32, [room, turned]: [[f32; 2]; 2], frame: &[f32]) -> PixelParts {
@@ -165,14 +217,15 @@ impl FusedOperation<3> for Composition {
         self.check(inputs)?;
         let (items, pixels) = (self.frame_of.len(), self.size.pixels());
         let mut out = vec![0.0; items * pixels];
+        let rows = out.chunks_exact_mut(self.size.width).enumerate();
         vectorized(
             #[inline(always)]
             || {
-                self.visit(
-                    inputs,
-                    #[inline(always)]
-                    |[pixel, ..], parts, _| out[pixel] = parts.mixed(),
-                );
+                for (row, out) in rows {
+                    for (part, out) in out.chunks_mut(SAMPLED_TOGETHER).enumerate() {
+                        self.mix(inputs, [row, part * SAMPLED_TOGETHER], out);
+                    }
+                }
             },
         );
         Ok((out, Shape::from((items, pixels))))

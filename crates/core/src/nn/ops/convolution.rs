@@ -3,9 +3,12 @@
 //! kernel row gives all output channels, and nothing is copied. candle's own CPU convolution is several times slower forth
 //! and back.
 
+use std::sync::Arc;
+
 use candle_core::{CpuStorage, Layout, Result, Shape, Tensor, bail};
 use candle_nn::Module;
 
+use super::packed::{PackedWeights, TapRun};
 use crate::nn::fused::{FusedOperation, Operand, apply};
 use crate::nn::tensors::{product, sum_columns};
 
@@ -42,6 +45,16 @@ pub(in crate::nn) struct Convolution3 {
     pub(in crate::nn) weight: Tensor,
     pub(in crate::nn) bias: Tensor,
     pub(in crate::nn) shape: ConvShape,
+    /// For prediction, which then does not use the tensors.
+    pub(in crate::nn) packed: Option<Arc<PackedWeights>>,
+}
+
+impl Convolution3 {
+    /// Packs the weights as they are now.
+    pub(in crate::nn) fn pack(&mut self) -> Result<()> {
+        self.packed = Some(PackedWeights::of(&self.weight, &self.bias)?);
+        Ok(())
+    }
 }
 
 impl Module for Convolution3 {
@@ -54,11 +67,11 @@ impl Module for Convolution3 {
 
 /// Sizes of one image of a convolution.
 #[derive(Clone, Copy)]
-struct ImageGeometry {
-    height: usize,
-    width: usize,
-    channels: usize,
-    shape: ConvShape,
+pub(super) struct ImageGeometry {
+    pub(super) height: usize,
+    pub(super) width: usize,
+    pub(super) channels: usize,
+    pub(super) shape: ConvShape,
 }
 
 /// Output places that one matrix product computes.
@@ -71,17 +84,8 @@ struct PlaceBlock {
     places: usize,
 }
 
-/// Taps of the kernel whose values lie side by side.
-struct TapRun {
-    /// From the beginning of the kernel, in the values of the bordered image.
-    offset: usize,
-    /// Rows of the weight.
-    first: usize,
-    length: usize,
-}
-
 impl ImageGeometry {
-    fn of((_, height, width, channels): (usize, usize, usize, usize), shape: ConvShape) -> Self {
+    pub(super) fn of((_, height, width, channels): (usize, usize, usize, usize), shape: ConvShape) -> Self {
         Self {
             height,
             width,
@@ -90,29 +94,29 @@ impl ImageGeometry {
         }
     }
 
-    fn out_height(self) -> usize {
+    pub(super) fn out_height(self) -> usize {
         self.height.div_ceil(self.shape.stride)
     }
 
-    fn out_width(self) -> usize {
+    pub(super) fn out_width(self) -> usize {
         self.width.div_ceil(self.shape.stride)
     }
 
-    fn places(self) -> usize {
+    pub(super) fn places(self) -> usize {
         self.out_height() * self.out_width()
     }
 
-    fn inputs(self) -> usize {
+    pub(super) fn inputs(self) -> usize {
         self.height * self.width * self.channels
     }
 
     /// Places in a row of the bordered image: `dilation` more on each side.
-    fn pitch(self) -> usize {
+    pub(super) fn pitch(self) -> usize {
         self.width + 2 * self.shape.dilation
     }
 
     /// Where the first place inside the border begins.
-    fn inside(self) -> usize {
+    pub(super) fn inside(self) -> usize {
         self.shape.dilation * (self.pitch() + 1) * self.channels
     }
 
@@ -131,7 +135,7 @@ impl ImageGeometry {
     }
 
     /// The taps: whole rows of the kernel where they are neighbours.
-    fn runs(self) -> impl Iterator<Item = TapRun> {
+    pub(super) fn runs(self) -> impl Iterator<Item = TapRun> {
         let (channels, dilation) = (self.channels, self.shape.dilation);
         let columns = if dilation == 1 { 1 } else { SIDE };
         (0..SIDE).flat_map(move |row| {

@@ -3,12 +3,15 @@
 // `pulp` compiles a closure with vector instructions; that includes only functions that are inlined into it.
 #![allow(clippy::inline_always)]
 
+use std::sync::Arc;
+
 use candle_core::{CpuStorage, Layout, Result, Shape, Tensor};
 use candle_nn::Module;
 
 use super::activation::tanh;
+use super::packed::PackedWeights;
 use crate::nn::fused::{FusedOperation, Operand, apply};
-use crate::nn::tensors::{add_columns, product, slice, sum_columns};
+use crate::nn::tensors::{add_columns, product, slice, sum_columns, with_values};
 use crate::vectorized::vectorized;
 
 /// y = x · weight + bias, or its tanh; weight `[D, O]`, bias `[O]`.
@@ -17,11 +20,27 @@ pub(in crate::nn) struct Linear {
     pub(in crate::nn) weight: Tensor,
     pub(in crate::nn) bias: Tensor,
     pub(in crate::nn) has_tanh: bool,
+    /// For prediction, which then does not use the tensors.
+    pub(in crate::nn) packed: Option<Arc<PackedWeights>>,
+}
+
+impl Linear {
+    /// Packs the weights of a layer without tanh as they are now.
+    pub(in crate::nn) fn pack(&mut self) -> Result<()> {
+        self.packed = Some(PackedWeights::of(&self.weight, &self.bias)?);
+        Ok(())
+    }
 }
 
 impl Module for Linear {
     /// The layer's output `[N, O]` for x `[N, D]`, all f32.
     fn forward(&self, x: &Tensor) -> Result<Tensor> {
+        if let Some(packed) = self.packed.as_ref().filter(|_| !self.has_tanh) {
+            let rows = x.dims2()?.0;
+            let mut out = vec![0.0; rows * packed.outputs()];
+            with_values(x, |x| packed.multiply_rows(x, &mut out))?;
+            return Tensor::from_vec(out, (rows, packed.outputs()), x.device());
+        }
         let has_tanh = self.has_tanh;
         apply(FusedLinear { has_tanh }, [x, &self.weight, &self.bias])
     }

@@ -7,7 +7,9 @@ use candle_nn::Module as _;
 
 use super::activation::sigmoid;
 use super::linear::Linear;
+use super::packed::PackedWeights;
 use crate::nn::fused::{FusedOperation, Operand, apply};
+use crate::nn::tensors::with_values;
 use crate::vectorized::vectorized;
 
 /// x · σ(x) of each value ("`SiLU`").
@@ -17,6 +19,17 @@ pub(in crate::nn) fn silu(x: &Tensor) -> Result<Tensor> {
 
 /// Linear layers with [`silu`] between them.
 pub(in crate::nn) fn perceptron(layers: &[Linear], x: &Tensor) -> Result<Tensor> {
+    if let Some(packed) = layers
+        .iter()
+        .map(|layer| layer.packed.as_deref())
+        .collect::<Option<Vec<_>>>()
+    {
+        let outputs = packed.last().map_or(0, |last| last.outputs());
+        let out = with_values(x, |x| {
+            packed_perceptron(&packed, x, x.len() / layers[0].weight.dims()[0])
+        })?;
+        return Tensor::from_vec(out, ((), outputs), x.device());
+    }
     let mut values = x.clone();
     for (index, layer) in layers.iter().enumerate() {
         if index > 0 {
@@ -27,6 +40,49 @@ pub(in crate::nn) fn perceptron(layers: &[Linear], x: &Tensor) -> Result<Tensor>
     Ok(values)
 }
 
+/// Rows that go through all layers together, so that what is between the layers stays in the fastest cache.
+const ROWS_TOGETHER: usize = 64;
+
+fn packed_perceptron(layers: &[&PackedWeights], x: &[f32], rows: usize) -> Vec<f32> {
+    let outputs = layers.last().map_or(0, |last| last.outputs());
+    let inputs = x.len() / rows.max(1);
+    let mut out = vec![0.0; rows * outputs];
+    let widest = layers.iter().map(|layer| layer.outputs()).max().unwrap_or(0);
+    let mut buffers = [0, 1].map(|_| vec![0.0; ROWS_TOGETHER * widest]);
+    for (x, out) in x
+        .chunks(ROWS_TOGETHER * inputs)
+        .zip(out.chunks_mut(ROWS_TOGETHER * outputs))
+    {
+        let rows = out.len() / outputs;
+        let [from, to] = &mut buffers;
+        let mut length = 0;
+        for (index, layer) in layers.iter().enumerate() {
+            let read = if index == 0 { x } else { &from[..length] };
+            if index + 1 == layers.len() {
+                layer.multiply_rows(read, out);
+                break;
+            }
+            length = rows * layer.outputs();
+            layer.multiply_rows(read, &mut to[..length]);
+            activate_all(&mut to[..length]);
+            std::mem::swap(from, to);
+        }
+    }
+    out
+}
+
+/// SiLU of each value, in place.
+pub(super) fn activate_all(values: &mut [f32]) {
+    vectorized(
+        #[inline(always)]
+        || {
+            for value in values {
+                *value = activate(*value);
+            }
+        },
+    );
+}
+
 /// SiLU(x · (1 + scale) + shift) of x `[N, …, C]`, with `modulation` `[N, 2 · C]`: the scales of an item, then its shifts.
 /// Errors: shapes that do not fit.
 pub(in crate::nn) fn modulated_silu(x: &Tensor, modulation: &Tensor) -> Result<Tensor> {
@@ -34,7 +90,7 @@ pub(in crate::nn) fn modulated_silu(x: &Tensor, modulation: &Tensor) -> Result<T
 }
 
 #[inline(always)]
-fn activate(x: f32) -> f32 {
+pub(super) fn activate(x: f32) -> f32 {
     x * sigmoid(x)
 }
 

@@ -18,6 +18,12 @@ pub(in crate::nn) struct Neighbourhood {
     pub(in crate::nn) moves: [bool; 2],
 }
 
+/// Places that are sampled together, so that the arithmetic of all is a few vector instructions.
+pub(in crate::nn) const SAMPLED_TOGETHER: usize = 16;
+
+/// One number of each of some places.
+pub(in crate::nn) type OfPlaces = [f32; SAMPLED_TOGETHER];
+
 /// Height and width of an image in pixels.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(in crate::nn) struct ImageSize {
@@ -49,6 +55,43 @@ impl ImageSize {
     pub(in crate::nn) fn outside(self, [x, y]: [f32; 2]) -> f32 {
         let beyond = |at: f32, side: usize| (-at).max(at - (side as f32 - 1.0)).max(0.0);
         beyond(x, self.width) + beyond(y, self.height)
+    }
+
+    /// The values of an image of one channel at several places: what [`ImageSize::around`] and [`Neighbourhood::sample`] give,
+    /// to the bit.
+    #[inline(always)]
+    pub(in crate::nn) fn sample(self, image: &[f32], [x, y]: &[OfPlaces; 2]) -> OfPlaces {
+        let (last_x, last_y) = ((self.width - 1) as f32, (self.height - 1) as f32);
+        let most_left = self.width.saturating_sub(2) as i32;
+        let most_top = self.height.saturating_sub(2) as i32;
+        let step_x = usize::from(self.width > 1);
+        let step_y = if self.height > 1 { self.width } else { 0 };
+        let (mut first, mut right, mut lower) = (
+            [0i32; SAMPLED_TOGETHER],
+            [0.0; SAMPLED_TOGETHER],
+            [0.0; SAMPLED_TOGETHER],
+        );
+        for at in 0..SAMPLED_TOGETHER {
+            let (inside_x, inside_y) = (x[at].clamp(0.0, last_x), y[at].clamp(0.0, last_y));
+            let (left, top) = ((inside_x as i32).min(most_left), (inside_y as i32).min(most_top));
+            first[at] = top * self.width as i32 + left;
+            right[at] = inside_x - left as f32;
+            lower[at] = inside_y - top as f32;
+        }
+        let [mut a, mut b, mut c, mut d] = [[0.0; SAMPLED_TOGETHER]; 4];
+        for at in 0..SAMPLED_TOGETHER {
+            let first = first[at] as usize;
+            a[at] = image[first];
+            b[at] = image[first + step_x];
+            c[at] = image[first + step_y];
+            d[at] = image[first + step_y + step_x];
+        }
+        let mut values = [0.0; SAMPLED_TOGETHER];
+        for at in 0..SAMPLED_TOGETHER {
+            let upper = a[at] + (b[at] - a[at]) * right[at];
+            values[at] = upper + (c[at] + (d[at] - c[at]) * right[at] - upper) * lower[at];
+        }
+        values
     }
 
     /// Around the place [column, row], counted from the first pixel's middle; beyond the border, the border's pixel.
@@ -206,6 +249,22 @@ mod tests {
         assert_eq!(size.around(-3.0, 9.0).sample(&image), 10.0);
         assert_eq!(size.around(1.5, 0.25).slopes(&image), [1.0, 10.0]);
         assert_eq!(size.around(-3.0, 0.5).slopes(&image), [0.0, 10.0]);
+    }
+
+    #[test]
+    fn places_sampled_together_have_the_bits_of_each() {
+        for size in [ImageSize { height: 5, width: 7 }, ImageSize { height: 1, width: 1 }] {
+            let image = noise(&[size.pixels()], 1).to_vec1::<f32>().unwrap();
+            let places = noise(&[2, SAMPLED_TOGETHER], 2).affine(4.0, 3.0).unwrap();
+            let [x, y] = [0, 1].map(|axis| {
+                let of_places = places.get(axis).unwrap().to_vec1::<f32>().unwrap();
+                OfPlaces::try_from(of_places).unwrap()
+            });
+            let together = size.sample(&image, &[x, y]);
+            for at in 0..SAMPLED_TOGETHER {
+                assert_eq!(together[at], size.around(x[at], y[at]).sample(&image));
+            }
+        }
     }
 
     #[test]
