@@ -116,11 +116,7 @@ fn found_together(
     rays: &[[f32; 3]],
 ) -> [OfPlaces; PLACE_VALUES] {
     let mut directions = [[0.0; SAMPLED_TOGETHER]; 3];
-    for (at, &[ahead, left, up]) in rays.iter().enumerate() {
-        [directions[0][at], directions[1][at], directions[2][at]] = [ahead, left, up];
-    }
-    for at in 0..SAMPLED_TOGETHER {
-        let ray = [directions[0][at], directions[1][at], directions[2][at]];
+    for (at, &ray) in rays.iter().enumerate() {
         [directions[0][at], directions[1][at], directions[2][at]] = rotated(ray, motion.sin, motion.cos);
     }
     let turned = projected(viewer, &directions);

@@ -73,9 +73,12 @@ fn predict(
             }),
         }
     };
-    with_values(x, |x| match activation {
-        Activation::Modulated(modulation) => with_values(modulation, |modulation| convolve(x, modulation)),
-        _ => Ok(convolve(x, &[])),
+    with_values(x, |x| {
+        if let Activation::Modulated(modulation) = activation {
+            return with_values(modulation, |modulation| convolve(x, modulation));
+        }
+        convolve(x, &[]);
+        Ok(())
     })??;
     Tensor::from_vec(out, shape, x.device())
 }

@@ -71,7 +71,7 @@ fn packed_perceptron(layers: &[&PackedWeights], x: &[f32], rows: usize) -> Vec<f
     out
 }
 
-/// SiLU of each value, in place.
+/// `SiLU` of each value, in place.
 pub(super) fn activate_all(values: &mut [f32]) {
     vectorized(
         #[inline(always)]
