@@ -62,11 +62,11 @@ class Dreaming {
     if (!this.stream && this.robot.context.length < this.robot.spec.context) return;
     if (!this.stream) await this.fallAsleep();
     if (this.is_over) return;
-    const { spec, is_drivable } = this.robot;
+    const { model, is_drivable } = this.robot;
     // A recording does not follow the keys, and a new episode has nothing to do with the dream.
     const is_manual = isManual();
     this.is_alone ||= moment.begins || (is_manual && !is_drivable);
-    const action = !is_drivable && is_manual ? heldAction(spec.actions) : moment.action;
+    const action = !is_drivable && is_manual ? heldAction(model) : moment.action;
     const real = this.is_alone ? null : moment.frame;
     this.moments.push({ imagined: this.frame, real, novelty: this.novelty, error: real ? mse(this.frame, real) : null });
     const answer = await this.stream.send({ frame: this.frame, action, state: this.state, steps: 1 });

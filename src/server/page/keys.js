@@ -34,20 +34,22 @@ const TURNS = ["angular", "angle", "steer", "steering", "yaw", "yaw_rate"];
 const SPEEDS = ["linear", "throttle", "speed", "velocity"];
 
 // The action for how much ahead and left (-1 to 1 each), in the order of the channels. The simulated robot's limits are known; for
-// others, two standard deviations of the training data around the mean.
-export function actionFor(channels, ahead, left) {
-  return channels.map(({ name, unit, mean, std }) => {
+// others, two standard deviations of the training data around the mean, inside of the model's bounds.
+export function actionFor({ spec, action_bounds = [] }, ahead, left) {
+  return spec.actions.map(({ name, unit, mean, std }, place) => {
     const pull = TURNS.includes(name) ? left : SPEEDS.includes(name) ? ahead : 0;
     if (name === "linear" && unit === "m/s") return SPEED_M_S * pull;
     if (name === "angular" && unit === "rad/s") return TURN_RAD_S * pull;
     // Most cars count steering to the right.
-    return mean + 2 * std * (["angle", "steer", "steering"].includes(name) ? -pull : pull);
+    const wanted = mean + 2 * std * (["angle", "steer", "steering"].includes(name) ? -pull : pull);
+    const { low = -Infinity, high = Infinity } = action_bounds[place] ?? {};
+    return Math.min(Math.max(wanted, low), high);
   });
 }
 
-export function heldAction(channels) {
+export function heldAction(model) {
   const pull = (plus, minus) => held.has(plus) - held.has(minus);
-  return actionFor(channels, pull("ahead", "back"), pull("left", "right"));
+  return actionFor(model, pull("ahead", "back"), pull("left", "right"));
 }
 
 function onKey(event, down) {

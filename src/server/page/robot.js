@@ -66,7 +66,7 @@ export class Robot {
 
   nextAction(moment) {
     if (this.plan.length) return this.plan.shift();
-    return this.is_drivable && isManual() ? heldAction(this.spec.actions) : moment.driver;
+    return this.is_drivable && isManual() ? heldAction(this.model) : moment.driver;
   }
 
   async run() {

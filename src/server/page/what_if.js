@@ -27,7 +27,7 @@ function present(robot) {
 }
 
 function requestFor(robot, context) {
-  const plans = PLANS.map(([, ahead, left]) => Array(robot.spec.horizon).fill(actionFor(robot.spec.actions, ahead, left)));
+  const plans = PLANS.map(([, ahead, left]) => Array(robot.spec.horizon).fill(actionFor(robot.model, ahead, left)));
   return { ...contextBody(robot.model, context), plans };
 }
 
