@@ -156,7 +156,7 @@ impl Search {
             };
             predicted = Some((prediction, asked.elapsed()));
         }
-        let choice = planner.finish();
+        let choice = app.predictions.run(move || planner.finish()).await?;
         self.count(&choice);
         Ok(ChosenPlan {
             model: self.model,

@@ -124,11 +124,11 @@ impl Judge {
         self.obstacles = Some(Obstacles::new(points, height_m, self.input.settings.robot_height_m));
     }
 
-    /// Stopping, and the present plan if there is one, within the limits.
+    /// Stopping, which only the largest changes limit, and the present plan if there is one, within the limits.
     pub(super) fn fixed_plans(&self) -> Vec<Tried> {
         let channels = self.limits.channels().len();
         let mut stop = vec![0.0; self.steps * channels];
-        self.limits.enforce(&mut stop);
+        self.limits.with_zero().enforce(&mut stop);
         let mut fixed = vec![Tried::new(CandidateKind::Stop, stop)];
         if let Some(held) = self.input.present.last() {
             let present = self.input.present.iter();
@@ -180,7 +180,9 @@ impl Judge {
     pub(super) fn total(&self, tried: &Tried, has_rollouts: bool) -> f32 {
         let counts = |term: &CostTerm| has_rollouts || !term.cost.needs_rollout();
         let terms = self.terms.iter().zip(&tried.values).filter(|(term, _)| counts(term));
-        terms.filter_map(|(term, value)| Some(term.weight * (*value)?)).sum()
+        let known = terms.filter_map(|(term, value)| Some(term.weight * (*value)?));
+        // An empty sum would be -0.
+        0.0 + known.sum::<f32>()
     }
 
     /// Root mean square of the differences, as a share of the ranges.
@@ -217,6 +219,11 @@ impl Judge {
 }
 
 impl Tried {
+    /// How unlike the training data it is; `None` if that is not known.
+    pub(super) fn novelty(&self) -> Option<f32> {
+        self.rollout.as_ref()?.novelty
+    }
+
     pub(super) fn new(kind: CandidateKind, plan: Vec<f32>) -> Self {
         Self {
             kind,

@@ -5,14 +5,17 @@ use serde::{Deserialize, Serialize};
 use super::error::PlanError;
 use crate::registry::Manifest;
 
+/// The largest limit.
+const MAX_LIMIT: f32 = 1e6;
+
 /// The limits of one action channel, in its unit.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(deny_unknown_fields)]
 pub struct ActionLimit {
-    /// Smallest value.
+    /// Smallest value, at least -1,000,000.
     pub low: f32,
-    /// Largest value.
+    /// Largest value, at most 1,000,000.
     pub high: f32,
     /// Largest change from one step to the next. Absent: any.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -79,6 +82,15 @@ impl ActionLimits {
         &self.channels
     }
 
+    /// The same limits, but a robot may also stop where its actions otherwise have to be larger.
+    pub(super) fn with_zero(&self) -> Self {
+        let mut limits = self.clone();
+        for limit in &mut limits.channels {
+            (limit.low, limit.high) = (limit.low.min(0.0), limit.high.max(0.0));
+        }
+        limits
+    }
+
     /// Moves the actions of a plan into the limits, step after step.
     pub(super) fn enforce(&self, plan: &mut [f32]) {
         let mut before = self.before.clone();
@@ -104,19 +116,16 @@ impl ActionLimit {
             value: f64::from(value),
             range,
         };
-        if !self.low.is_finite() {
-            return Err(wrong("low", self.low, "a finite number".to_owned()));
+        if !(-MAX_LIMIT..=MAX_LIMIT).contains(&self.low) {
+            return Err(wrong("low", self.low, format!("-{MAX_LIMIT} to {MAX_LIMIT}")));
         }
-        if !(self.high.is_finite() && self.high >= self.low) {
-            return Err(wrong(
-                "high",
-                self.high,
-                format!("at least limits[{index}].low, {}", self.low),
-            ));
+        if !(self.low..=MAX_LIMIT).contains(&self.high) {
+            let range = format!("at least limits[{index}].low, {}, and at most {MAX_LIMIT}", self.low);
+            return Err(wrong("high", self.high, range));
         }
         match self.max_change {
-            Some(change) if !(change.is_finite() && change > 0.0) => {
-                Err(wrong("max_change", change, "above 0".to_owned()))
+            Some(change) if !(change > 0.0 && change <= MAX_LIMIT) => {
+                Err(wrong("max_change", change, format!("above 0 and at most {MAX_LIMIT}")))
             }
             _ => Ok(()),
         }
@@ -156,12 +165,21 @@ mod tests {
         let refused = |found: Result<ActionLimits, PlanError>| found.unwrap_err().to_string();
         assert_eq!(
             refused(limits(Some(0.0), None)),
-            "limits[0].max_change is 0; it must be above 0"
+            "limits[0].max_change is 0; it must be above 0 and at most 1000000"
         );
         assert_eq!(
             refused(limits(None, Some(vec![0.0, 1.0]))),
             "action has 2 entries; model \"test\" has 1 action channels"
         );
+        for (low, high) in [(-3e38, 0.0), (0.0, 3e38), (f32::NAN, 0.0), (1.0, 0.0)] {
+            let limit = ActionLimit {
+                low,
+                high,
+                max_change: None,
+            };
+            let found = ActionLimits::new(Some(vec![limit]), None, &test_model().manifest);
+            assert!(refused(found).starts_with("limits[0]."), "{low} {high}");
+        }
         let unknown = refused(ActionLimits::new(None, None, &test_model().manifest));
         assert!(unknown.contains("not calibrated"), "{unknown}");
     }

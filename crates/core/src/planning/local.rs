@@ -161,8 +161,10 @@ mod tests {
         let mut blocked = input(SolverKind::Cem);
         blocked.settings.radius_m = 0.18;
         blocked.settings.costs.clear();
-        // It cannot stand, and can hardly turn.
-        blocked.settings.limits.as_mut().unwrap()[0].low = 0.4;
+        // It can hardly brake, and hardly turn.
+        blocked.before = Some(vec![0.5, 0.79].try_into().unwrap());
+        let limits = blocked.settings.limits.as_mut().unwrap();
+        (limits[0].low, limits[0].max_change) = (0.4, Some(0.01));
         blocked.settings.limits.as_mut().unwrap()[1].low = 0.79;
         let mut planner = Planner::new(&model, blocked).unwrap();
         let context = context(&model);
@@ -179,6 +181,17 @@ mod tests {
         assert!(choice.clearance_checked);
         assert_eq!(choice.unsafe_reason, Some(UnsafeReason::NoFreeWay));
         assert_eq!(choice.best.kind, CandidateKind::Stop);
+    }
+
+    #[test]
+    fn stopping_is_standing_whatever_the_limits() {
+        let model = test_speed_model();
+        let mut hurried = input(SolverKind::Cem);
+        hurried.settings.limits.as_mut().unwrap()[0].low = 0.4;
+        let answer = Planner::new(&model, hurried).unwrap().finish();
+        assert_eq!(answer.unsafe_reason, Some(UnsafeReason::NoTime));
+        assert!(answer.best.actions.iter().all(|action| action.as_slice() == [0.0, 0.0]));
+        assert!(answer.best.total.is_sign_positive());
     }
 
     #[test]

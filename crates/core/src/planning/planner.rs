@@ -157,7 +157,13 @@ impl Planner {
         let mut begun = self.fixed.iter().chain(&unjudged);
         let stop = begun.find(|tried| tried.kind == CandidateKind::Stop).cloned();
         let stop = stop.or_else(|| self.judge.fixed_plans().into_iter().next());
-        let novelty = self.fixed.iter().find_map(|tried| tried.rollout.as_ref()?.novelty);
+        let of_context = self.fixed.iter().find_map(Tried::novelty);
+        let is_unknown = |tried: &Tried| {
+            tried
+                .novelty()
+                .or(of_context)
+                .is_some_and(|novelty| novelty >= NOVELTY_LIMIT)
+        };
         let all: Vec<&Tried> = self.fixed.iter().chain(&self.drawn).collect();
         // Costs of predicted frames count only if all that are compared have them.
         let has_rollouts = self.drawn.iter().any(|tried| tried.rollout.is_some()) || self.drawn.is_empty();
@@ -167,16 +173,16 @@ impl Planner {
             .collect();
         let total = |tried: &Tried| self.judge.total(tried, has_rollouts);
         compared.sort_by(|one, two| {
-            (one.touches, total(one))
-                .partial_cmp(&(two.touches, total(two)))
+            (one.touches, is_unknown(one), total(one))
+                .partial_cmp(&(two.touches, is_unknown(two), total(two)))
                 .unwrap_or(std::cmp::Ordering::Equal)
         });
         let unsafe_reason = if compared.is_empty() {
             Some(UnsafeReason::NoTime)
-        } else if novelty.is_some_and(|novelty| novelty >= NOVELTY_LIMIT) {
-            Some(UnsafeReason::UnknownSurroundings)
         } else if compared[0].touches {
             Some(UnsafeReason::NoFreeWay)
+        } else if is_unknown(compared[0]) {
+            Some(UnsafeReason::UnknownSurroundings)
         } else {
             None
         };
