@@ -6,11 +6,8 @@ use crate::cli::process::print_line;
 use foreframe_core::frame::Frame;
 use foreframe_core::frame::preprocess::scale;
 use foreframe_core::frame::quality;
-use foreframe_core::registry::calibration::ExpectedError;
+use foreframe_core::registry::calibration::{ExpectedError, NOVELTY_LIMIT};
 use foreframe_core::serving::Rollout;
-
-/// From this novelty on, the expected errors say nothing: they were measured on contexts that are more like the training data.
-const NOVELTY_LIMIT: f32 = 0.99;
 
 /// Prints it. `truth` has the true frames after the context, as many as there are; `horizon` is the model's own.
 pub(super) fn print_trust(rollout: &Rollout, truth: &[Frame], horizon: usize) -> Result<(), CliError> {

@@ -13,7 +13,7 @@ use crate::types::Action;
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(rename_all = "kebab-case")]
 pub enum CandidateKind {
-    /// Stopping: every action is 0, or as near to it as the limits allow.
+    /// Stopping: every action is 0, or as near to it as the largest changes allow.
     Stop,
     /// The plan that the robot follows now.
     Present,
@@ -47,7 +47,7 @@ pub struct PlanCandidate {
 pub enum UnsafeReason {
     /// Under every plan, the robot would touch what the last frame shows.
     NoFreeWay,
-    /// The frames are unlike the training data, so that predictions say nothing.
+    /// Frames, state or actions are unlike the training data, so that predictions say nothing.
     UnknownSurroundings,
     /// The time was over before any plan was judged.
     NoTime,
@@ -57,7 +57,7 @@ impl fmt::Display for UnsafeReason {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
         out.write_str(match self {
             Self::NoFreeWay => "under every plan, the robot would touch what the last frame shows",
-            Self::UnknownSurroundings => "the frames are unlike the training data",
+            Self::UnknownSurroundings => "the frames, the state or the actions are unlike the training data",
             Self::NoTime => "the time was over before any plan was judged",
         })
     }

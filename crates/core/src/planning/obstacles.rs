@@ -21,8 +21,8 @@ pub struct Obstacles {
 }
 
 impl Obstacles {
-    /// From points ahead, left and up of a camera that is `camera_height_m` above the floor, as high as usual if that is not known. `tallest_m`: what is higher, the robot
-    /// passes under.
+    /// From points ahead, left and up of a camera that is `camera_height_m` above the floor, as high as usual if that is not known.
+    /// The robot passes under what is higher than `tallest_m`.
     #[must_use]
     pub fn new(points: &[[f32; 3]], camera_height_m: Option<f32>, tallest_m: f32) -> Self {
         let camera_height_m = camera_height_m.unwrap_or(CameraModel::USUAL_HEIGHT_M);

@@ -7,11 +7,10 @@ use super::error::PlanError;
 use super::judge::{Judge, PlannerInput, Tried};
 use super::solver::{SearchSpace, Solver};
 use crate::registry::Model;
+use crate::registry::calibration::NOVELTY_LIMIT;
 use crate::serving::{Prediction, Rollout};
 use crate::types::Action;
 
-/// From this novelty on, predictions say nothing.
-const NOVELTY_LIMIT: f32 = 0.99;
 /// Plans that are judged between two looks at the clock.
 const JUDGED_TOGETHER: usize = 64;
 /// Plans that are predicted together at most.

@@ -15,6 +15,9 @@ use crate::nn::ModelSpec;
 
 /// Numbers from which the error of a predicted frame is estimated, see [`RolloutInContext::error_inputs`].
 pub const ERROR_INPUTS: usize = 8;
+/// From this novelty on, a prediction and its expected errors say nothing: the calibration was fitted on contexts that are more like
+/// the training data.
+pub const NOVELTY_LIMIT: f32 = 0.99;
 /// Added to mean squared differences before their logarithm.
 const FLOOR: f64 = 1e-6;
 /// The distance of a value that is out of its range in training by the width of this range.

@@ -352,7 +352,7 @@ pub(super) struct PlanResponse {
     /// Whether the way was checked against what the depth network sees in the last frame. It knows nothing of what is beside or behind
     /// the camera, nor of where things move.
     clearance_checked: bool,
-    /// How unlike the training data the context is, 0…1; absent if the model is not calibrated.
+    /// How unlike the training data frames, state and the plan are, 0…1; absent if the model is not calibrated, or nothing was predicted.
     #[serde(skip_serializing_if = "Option::is_none")]
     novelty: Option<f32>,
     /// Plans that were judged.
