@@ -67,10 +67,9 @@ pub mod images {
 #[cfg(feature = "sim")]
 pub mod sim {
     pub use foreframe_sim::pid::Gains;
-    pub use foreframe_sim::scenario::Route;
     pub use foreframe_sim::{
-        CameraConfig, Environment, Look, Observation, PidGains, PlanarPose, RoomSet, Scenario, SimError, StepResult,
-        TrialParameters, TrialRoom, World, WorldConfig, action_channels, state_channels,
+        CameraConfig, CrossingHabits, Environment, Look, Observation, PidGains, PlanarPose, RoomSet, Route, Scenario,
+        SimError, StepResult, TrialParameters, TrialRoom, World, WorldConfig, action_channels, state_channels,
     };
 }
 

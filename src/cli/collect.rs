@@ -208,9 +208,9 @@ fn next_step(args: &CollectArgs, out: &Path, info: &DatasetInfo) -> Result<Strin
     }
     let presets: &[&str] = match args.scenario {
         CollectSubject::Simulated(Scenario::StaticObserver) => &["paper", "static"],
-        CollectSubject::Simulated(Scenario::MovingObserver) if args.rooms.is_some() => &["rooms"],
+        CollectSubject::Simulated(_) if args.rooms.is_some() => &["rooms"],
         CollectSubject::Simulated(Scenario::MovingObserver) => &["moving"],
-        CollectSubject::Simulated(Scenario::Crowded) => &["static"],
+        CollectSubject::Simulated(Scenario::Crowded | Scenario::Crossing) => &["static"],
         CollectSubject::MovingMnist => &[MOVING_MNIST],
     };
     let configs: Vec<TrainConfig> = presets

@@ -187,7 +187,7 @@ fn fan(args: &PlanArgs, goal: &Goal, choice: &PlanChoice) -> PlanFan {
         ways_m: ways
             .map(|way| way.iter().map(|[_, ahead, left]| [*ahead, *left]).collect())
             .collect(),
-        obstacles_m: choice.obstacles_m.clone(),
+        obstacles_m: choice.obstacles.fixed_m().to_vec(),
         goal_m: goal.position_m,
         radius_m: args.radius,
     }

@@ -9,7 +9,7 @@
 //! pixels of the last frame. Neither uses the other. [`network`] is the type that the rest of the program uses for both.
 //!
 //! The modules in reading order; each uses only those above it: `options` (enumerations) → [`error`] → [`tensors`] → `fused`
-//! (what an operation with a gradient of its own is) → `ops` (such operations) → [`loss`], [`ssim_loss`] → [`spec`] (sizes and
+//! (what an operation with a gradient of its own is) → `ops` (such operations) → [`loss`], [`ssim_loss`], [`mask_loss`] → [`spec`] (sizes and
 //! meaning of a model) → `model_tensors`, `conditioning` (actions and state) → `geometry` (cameras and wheels) → [`dense`], [`flow`] → `model_size` (tensors and cost) → `init`, [`parameters`] →
 //! [`network`]. [`costs`] compares the model's cost with other networks.
 
@@ -24,6 +24,7 @@ mod geometry;
 pub mod gradient_check;
 mod init;
 pub mod loss;
+pub mod mask_loss;
 mod model_size;
 mod model_tensors;
 pub mod network;
@@ -37,7 +38,7 @@ pub mod tensors;
 pub use conditioning::ConditioningTensors;
 pub use dense::Feedback;
 pub use error::{NnError, TensorError};
-pub use flow::FlowPrediction;
+pub use flow::{FlowPrediction, Occupancy};
 pub use loss::Loss;
 pub use network::Network;
 pub use options::{ArchitectureKind, Conditioning, PredictorOutput, Reconstruction, UnknownName};

@@ -4,10 +4,11 @@
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
+use super::crossing::Crossing;
 use super::pid::Pid;
 use super::robot::PlanarPose;
 use super::room::Room;
-use super::scenario::Route;
+use super::route::Route;
 use super::{appearance, arena, robot};
 
 /// A robot has reached its goal at this distance, in metres.
@@ -22,6 +23,8 @@ pub(super) struct Navigator {
     heading: Pid,
     distance: Pid,
     random: ChaCha8Rng,
+    /// Of a robot that drives to and fro.
+    crossing: Option<Crossing>,
 }
 
 impl Navigator {
@@ -31,11 +34,20 @@ impl Navigator {
             heading: Pid::new(route.gains.heading, robot::MAX_ANGULAR_RAD_S),
             distance: Pid::new(route.gains.distance, route.gains.max_linear_m_s),
             random,
+            crossing: route
+                .crossing
+                .map(|habits| Crossing::new(habits, arena::position(route.pose))),
         }
     }
 
-    /// The next velocity command, [m/s, rad/s]. The robot drives slowly if the goal is not ahead, and never backward.
-    pub(super) fn command(&mut self, pose: PlanarPose, dt: f32) -> [f32; 2] {
+    /// The next velocity command, [m/s, rad/s]. The robot drives slowly if the goal is not ahead, and never backward. `observer`:
+    /// the pose of Tb1, to which a crossing robot may react.
+    pub(super) fn command(&mut self, pose: PlanarPose, observer: PlanarPose, dt: f32) -> [f32; 2] {
+        if let Some(crossing) = &mut self.crossing
+            && crossing.stands(pose, observer, &mut self.random, dt)
+        {
+            return [0.0, 0.0];
+        }
         let distance = arena::distance(arena::position(pose), self.goal_m);
         let bearing = arena::bearing(pose, self.goal_m);
         let angular = self.heading.update(bearing, dt);
@@ -43,13 +55,25 @@ impl Navigator {
         [linear.max(0.0) * bearing.cos().max(0.0), angular]
     }
 
+    /// Whether a crossing robot turns back now, before it has arrived.
+    pub(super) fn turns_back(&mut self, dt: f32) -> bool {
+        let crossing = self.crossing.as_ref();
+        crossing.is_some_and(|crossing| crossing.turns_back(&mut self.random, dt))
+    }
+
     pub(super) fn has_arrived(&self, pose: PlanarPose) -> bool {
         arena::distance(arena::position(pose), self.goal_m) < ARRIVAL_M
     }
 
-    /// Draws a new goal from the start and goal positions; where the room has obstacles, one that can be reached straight
-    /// ahead, if there is one.
+    /// Chooses a new goal: the other end of its way for a crossing robot, else one of the start and goal positions at random; where
+    /// the room has obstacles, one that can be reached straight ahead, if there is one.
     pub(super) fn choose_goal(&mut self, room: &Room, pose: PlanarPose) {
+        self.heading.reset();
+        self.distance.reset();
+        if let Some(crossing) = &mut self.crossing {
+            std::mem::swap(&mut self.goal_m, &mut crossing.back_m);
+            return;
+        }
         let here = arena::position(pose);
         let mut positions: Vec<[f32; 2]> = (room.starts_m.into_iter().chain(room.goals_m))
             .filter(|&position| position != self.goal_m && arena::distance(here, position) >= NEXT_GOAL_M)
@@ -62,7 +86,5 @@ impl Navigator {
         if let Some(&goal) = positions.get(self.random.random_range(0..positions.len().max(1))) {
             self.goal_m = goal;
         }
-        self.heading.reset();
-        self.distance.reset();
     }
 }

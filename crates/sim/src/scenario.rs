@@ -11,19 +11,17 @@ use serde::{Deserialize, Serialize};
 
 use super::config::{CameraConfig, WorldConfig, in_range};
 use super::error::SimError;
-use super::pid::Gains;
 use super::robot::PlanarPose;
 use super::room::Room;
 use super::room_set::RoomSet;
 use super::rooms::free_place;
-use super::{arena, robot};
+use super::route::{PidGains, Route};
+use super::{arena, crossing, robot};
 use foreframe_core::types::Seed;
 
 /// (start, goal) pairs of Tb2 that are never used for training. Their routes cross routes of the other pairs.
 pub const HELD_OUT_PAIRS: [(usize, usize); 2] = [(1, 0), (2, 3)];
-/// Range of Tb2's proportional heading gain, drawn uniformly.
-pub const HEADING_GAIN: Range<f32> = 1.2..4.0;
-/// The tenth of [`HEADING_GAIN`] that is never used for training.
+/// The tenth of the range of Tb2's heading gain that is never used for training.
 pub const HELD_OUT_HEADING_GAIN: Range<f32> = 2.44..2.72;
 /// Robots in `crowded` besides Tb1 and Tb2.
 const CROWD: usize = 3;
@@ -41,11 +39,19 @@ pub enum Scenario {
     MovingObserver,
     /// Like `moving-observer`, with three more robots.
     Crowded,
+    /// Like `moving-observer`, with one, four or eight more robots that drive to and fro across the way ahead of Tb1; some
+    /// halt, turn back, or stand while Tb1 is close before them.
+    Crossing,
 }
 
 impl Scenario {
     /// All scenarios.
-    pub const ALL: [Self; 3] = [Self::StaticObserver, Self::MovingObserver, Self::Crowded];
+    pub const ALL: [Self; 4] = [
+        Self::StaticObserver,
+        Self::MovingObserver,
+        Self::Crowded,
+        Self::Crossing,
+    ];
 
     /// The scenario's name, on the command line and on disk.
     #[must_use]
@@ -54,6 +60,7 @@ impl Scenario {
             Self::StaticObserver => "static-observer",
             Self::MovingObserver => "moving-observer",
             Self::Crowded => "crowded",
+            Self::Crossing => "crossing",
         }
     }
 
@@ -86,50 +93,6 @@ impl FromStr for Scenario {
             known: Self::ALL.map(Self::name).join(", "),
         })
     }
-}
-
-/// Gains of a robot's two PID controllers, for heading and distance, and its highest speed.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
-#[serde(deny_unknown_fields)]
-pub struct PidGains {
-    /// From heading error (rad) to angular velocity (rad/s).
-    pub heading: Gains,
-    /// From distance to the goal (m) to linear velocity (m/s).
-    pub distance: Gains,
-    /// Highest linear velocity, in m/s.
-    pub max_linear_m_s: f32,
-}
-
-impl PidGains {
-    fn draw(random: &mut ChaCha8Rng) -> Self {
-        Self {
-            heading: Gains {
-                proportional: random.random_range(HEADING_GAIN),
-                integral: random.random_range(0.0..3.0),
-                derivative: random.random_range(0.0..0.2),
-            },
-            distance: Gains {
-                proportional: random.random_range(0.5..1.1),
-                integral: random.random_range(0.0..0.1),
-                derivative: random.random_range(0.0..0.1),
-            },
-            max_linear_m_s: random.random_range(0.3..0.6),
-        }
-    }
-}
-
-/// Start pose, first goal and controller gains of a robot.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
-#[serde(deny_unknown_fields)]
-pub struct Route {
-    /// Pose at the start.
-    pub pose: PlanarPose,
-    /// The first goal, [x, y].
-    pub goal_m: [f32; 2],
-    /// Gains of its controllers.
-    pub gains: PidGains,
 }
 
 /// The room and the camera of a trial that has its own.
@@ -199,24 +162,42 @@ impl TrialParameters {
         let ahead = facing(start_m, room.goals_m[goal]);
         let start_heading_rad = robot::wrap(ahead + random.random_range(-1.5..1.5));
         let mut taken = vec![start_m];
+        // The free way ahead of Tb1, for those that cross it.
+        let mut way_m = 0.0;
         let observer = if scenario.observer_drives() {
             let position = free_position(&room, &mut random, &taken, 1.0);
             taken.push(position);
-            let heading = facing(position, start_m) + random.random_range(-0.6..0.6);
+            let heading = if scenario == Scenario::Crossing {
+                let (heading, length_m) = crossing::free_heading(&room, position, &mut random);
+                way_m = length_m;
+                heading
+            } else {
+                facing(position, start_m) + random.random_range(-0.6..0.6)
+            };
             pose(position, robot::wrap(heading))
         } else {
             standing_observer(&room, &mut random)
         };
-        let crowd_size = if scenario == Scenario::Crowded { CROWD } else { 0 };
+        let crowd_size = match scenario {
+            Scenario::Crowded => CROWD,
+            Scenario::Crossing => crossing::COUNTS[(trial % crossing::COUNTS.len() as u64) as usize],
+            Scenario::StaticObserver | Scenario::MovingObserver => 0,
+        };
         let crowd = (0..crowd_size)
             .map(|_| {
-                let position = free_position(&room, &mut random, &taken, 0.6);
-                taken.push(position);
-                Route {
-                    pose: pose(position, random.random_range(-3.1..3.1)),
-                    goal_m: room.goals_m[random.random_range(0..room.goals_m.len())],
-                    gains: PidGains::draw(&mut random),
-                }
+                let crosses = scenario == Scenario::Crossing;
+                let crossing = crosses.then(|| crossing::draw_route(&room, observer, way_m, &taken, &mut random));
+                let route = crossing.flatten().unwrap_or_else(|| {
+                    let position = free_position(&room, &mut random, &taken, 0.6);
+                    Route {
+                        pose: pose(position, random.random_range(-3.1..3.1)),
+                        goal_m: room.goals_m[random.random_range(0..room.goals_m.len())],
+                        gains: PidGains::draw(&mut random),
+                        crossing: None,
+                    }
+                });
+                taken.push(arena::position(route.pose));
+                route
             })
             .collect();
         Self {
@@ -271,6 +252,7 @@ impl TrialParameters {
             pose: pose(room.starts_m[self.start], self.start_heading_rad),
             goal_m: room.goals_m[self.goal],
             gains: self.gains,
+            crossing: None,
         };
         std::iter::once(tb2).chain(self.crowd.iter().copied()).collect()
     }

@@ -96,12 +96,13 @@ impl OtherRobot {
         let is_touching = physics.is_touching(robot);
         self.blocked_s = if is_touching { self.blocked_s + dt } else { 0.0 };
         if let Some(room) = next_goals
-            && (self.navigator.has_arrived(pose) || self.blocked_s > BLOCKED_LIMIT_S)
+            && (self.navigator.has_arrived(pose) || self.blocked_s > BLOCKED_LIMIT_S || self.navigator.turns_back(dt))
         {
             self.navigator.choose_goal(room, pose);
             self.blocked_s = 0.0;
         }
-        physics.command(robot, self.navigator.command(pose, dt));
+        let observer = physics.pose(0);
+        physics.command(robot, self.navigator.command(pose, observer, dt));
     }
 }
 

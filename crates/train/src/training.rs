@@ -95,7 +95,7 @@ pub fn run(
     // Check the data before creating the directory, so that a refused training leaves no files.
     let plan = TrainingPlan::new(config, dataset)?;
     if let Some(start) = training.start {
-        start::parameters(&plan, start)?;
+        start::parameters(&plan, start, config.seed)?;
     }
     let _lock = files.lock()?;
     let model_dir = files.path(MODEL_DIR);
@@ -170,7 +170,7 @@ fn initial_parameters(
 ) -> Result<Option<Parameters>, TrainError> {
     let config = training.config;
     if let Some(start) = training.start {
-        return start::parameters(plan, start).map(Some);
+        return start::parameters(plan, start, config.seed).map(Some);
     }
     let parameters = Parameters::initialize(&plan.spec, config.seed.derive("weights", 0))?;
     if plan.spec.flow().is_some() {

@@ -173,7 +173,7 @@ impl Search {
         budget: Option<Duration>,
     ) -> Result<Option<Prediction>, ApiError> {
         let inputs = ConditioningInput::of_plans(batch.plans, state, Some(steps), &self.model.manifest)?;
-        let task = self.context.task(inputs, batch.sees_points);
+        let task = self.context.task(inputs, batch.sees_occupancy);
         let computed = app.predictor().compute(&self.model, task, self.session);
         let Some(budget) = budget else {
             return Ok(Some(computed.await?));

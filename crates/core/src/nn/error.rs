@@ -64,6 +64,9 @@ pub enum NnError {
         /// The conditioning.
         conditioning: Conditioning,
     },
+    /// Only the depth form finds movers.
+    #[error("model specification: flow.movers is true, but flow.depth is false; only the depth form finds movers")]
+    MoversDepth,
     /// Two forms of the flow network at once.
     #[error("model specification: flow.recurrent and flow.depth are both true; a network has one of these forms")]
     RecurrentDepth,

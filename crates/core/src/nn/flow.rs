@@ -13,7 +13,7 @@
 //! camera saw each of its pixels.
 //!
 //! Reading order: `room_geometry` → `encoder_views` and `rollout_rows` (what the network reads) → `scene` and `motion`, or
-//! `depth_views`, `reprojection` and `depth_head` → `layers` (its tensors) → `network` → `direct`, `recurrent` and `depth` (its
+//! `depth_views`, `reprojection`, `depth_head`, `mover_head` and `occupancy` → `layers` (its tensors) → `network` → `direct`, `recurrent` and `depth` (its
 //! three forms) → `predict` → `beyond_horizon`.
 
 mod beyond_horizon;
@@ -25,7 +25,9 @@ mod direct;
 mod encoder_views;
 mod layers;
 mod motion;
+mod mover_head;
 mod network;
+mod occupancy;
 mod predict;
 mod recurrent;
 mod reprojection;
@@ -36,3 +38,4 @@ mod scene;
 pub(super) use layers::{multiply_adds_per_frame, tensor_shapes};
 pub(super) use network::FlowNetwork;
 pub use network::FlowPrediction;
+pub use occupancy::Occupancy;

@@ -7,7 +7,7 @@ use candle_core::{DType, Device, Tensor, Var};
 use super::conditioning::ConditioningTensors;
 use super::dense::{DenseNetwork, Feedback};
 use super::error::NnError;
-use super::flow::{FlowNetwork, FlowPrediction};
+use super::flow::{FlowNetwork, FlowPrediction, Occupancy};
 use super::geometry::state_channels::StateChannels;
 use super::geometry::wheel_dynamics;
 use super::model_tensors::ModelTensors;
@@ -205,17 +205,17 @@ impl Network {
         Ok(Some(motions))
     }
 
-    /// The points that the last frame of each of B windows with `codes` [B, context, `code_len`] shows, one for each pixel: ahead,
-    /// left and up of the camera, in metres. Empty if the network estimates no depth. Errors: `Shape`, `Missing`.
-    pub fn seen_points(
+    /// What stands around the robot at the last frame of each of B windows with `codes` [B, context, `code_len`], and where movers
+    /// will be under its actions; `None` if the network estimates no depth. Errors: `Shape`, `Missing`.
+    pub fn occupancy(
         &self,
         codes: &Tensor,
         conditioning: &ConditioningTensors,
-    ) -> Result<Vec<Vec<[f32; 3]>>, NnError> {
+    ) -> Result<Option<Vec<Occupancy>>, NnError> {
         self.check_windows(codes)?;
         match &self.network {
-            AnyNetwork::Dense(_) => Ok(Vec::new()),
-            AnyNetwork::Flow(flow) => flow.seen_points(codes, conditioning),
+            AnyNetwork::Dense(_) => Ok(None),
+            AnyNetwork::Flow(flow) => flow.occupancy(codes, conditioning),
         }
     }
 

@@ -5,6 +5,7 @@ use std::fmt;
 use serde::{Deserialize, Serialize};
 
 use super::cost::PlanCost;
+use super::obstacles::Obstacles;
 use crate::serving::Rollout;
 use crate::types::Action;
 
@@ -34,7 +35,7 @@ pub struct PlanCandidate {
     pub costs: Vec<(PlanCost, f32)>,
     /// Yaw, ahead and left since the last frame after each action, in radians and metres; `None` if the actions are no speeds.
     pub motion: Option<Vec<[f32; 3]>>,
-    /// The least distance from the robot's footprint to what the last frame shows, in metres; `None` if that is not known.
+    /// The least distance from the robot's footprint to what the last frame shows, and to where movers will be, in metres; `None` if that is not known.
     pub clearance_m: Option<f32>,
     /// What the camera is predicted to show; `None` if there was no time to predict it.
     pub rollout: Option<Rollout>,
@@ -45,7 +46,7 @@ pub struct PlanCandidate {
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(rename_all = "kebab-case")]
 pub enum UnsafeReason {
-    /// Under every plan, the robot would touch what the last frame shows.
+    /// Under every plan, the robot would touch what the last frame shows, or a mover.
     NoFreeWay,
     /// Frames, state or actions are unlike the training data, so that predictions say nothing.
     UnknownSurroundings,
@@ -56,7 +57,7 @@ pub enum UnsafeReason {
 impl fmt::Display for UnsafeReason {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
         out.write_str(match self {
-            Self::NoFreeWay => "under every plan, the robot would touch what the last frame shows",
+            Self::NoFreeWay => "under every plan, the robot would touch what the last frame shows, or a mover",
             Self::UnknownSurroundings => "the frames, the state or the actions are unlike the training data",
             Self::NoTime => "the time was over before any plan was judged",
         })
@@ -74,8 +75,8 @@ pub struct PlanChoice {
     pub unsafe_reason: Option<UnsafeReason>,
     /// Whether the way was checked against what the depth network sees.
     pub clearance_checked: bool,
-    /// Where the last frame shows something that a robot would touch: metres ahead and to the left.
-    pub obstacles_m: Vec<[f32; 2]>,
+    /// What stands in the way, and where movers will be.
+    pub obstacles: Obstacles,
     /// Plans that were judged.
     pub samples: usize,
     /// Plans whose frames were predicted.

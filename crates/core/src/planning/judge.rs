@@ -9,8 +9,8 @@ use super::obstacles::Obstacles;
 use super::settings::PlanSettings;
 use crate::frame::preprocess::scale;
 use crate::frame::warp::CameraModel;
-use crate::nn::NnError;
 use crate::nn::spec::MAX_STEPS;
+use crate::nn::{NnError, Occupancy};
 use crate::registry::Model;
 use crate::serving::{ConditioningInput, Rollout, check_size};
 use crate::types::{Action, RobotState};
@@ -116,12 +116,12 @@ impl Judge {
         self.obstacles.as_ref()
     }
 
-    /// Takes the points that the last frame shows: ahead, left and up of the camera.
-    pub(super) fn see(&mut self, points: &[[f32; 3]]) {
+    /// Takes what stands around the robot.
+    pub(super) fn see(&mut self, occupancy: &Occupancy) {
         let flow = self.model.spec().flow();
         let camera = self.input.camera.or(flow.and_then(|flow| flow.camera));
         let height_m = camera.and_then(|camera| camera.height_m);
-        self.obstacles = Some(Obstacles::new(points, height_m, self.input.settings.robot_height_m));
+        self.obstacles = Some(Obstacles::new(occupancy, height_m, self.input.settings.robot_height_m));
     }
 
     /// Stopping, which only the largest changes limit, and the present plan if there is one, within the limits.
@@ -158,7 +158,7 @@ impl Judge {
         let settings = &self.input.settings;
         if let (Some(obstacles), Some(motion)) = (&self.obstacles, &tried.motion) {
             let least = obstacles.least_clearance_m(motion, settings.radius_m);
-            let standing = obstacles.clearance_m([0.0; 2], settings.radius_m);
+            let standing = obstacles.clearance_m([0.0; 2], 0, settings.radius_m);
             tried.touches = least < 0.0 && least < standing - DRIVES_AWAY_M;
             tried.clearance_m = Some(least);
         }

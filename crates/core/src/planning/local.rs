@@ -23,8 +23,8 @@ impl PlanContext {
 
     /// The task that predicts these plans.
     #[must_use]
-    pub fn task(&self, conditioning_inputs: Vec<ConditioningInput>, sees_points: bool) -> Task {
-        self.task.with_rollouts(conditioning_inputs, sees_points)
+    pub fn task(&self, conditioning_inputs: Vec<ConditioningInput>, sees_occupancy: bool) -> Task {
+        self.task.with_rollouts(conditioning_inputs, sees_occupancy)
     }
 }
 
@@ -38,7 +38,7 @@ pub fn plan(model: &Model, context: &PlanContext, input: PlannerInput) -> Result
     while let Some(batch) = planner.next_batch(&|| begun.elapsed())? {
         let asked = Instant::now();
         let inputs = ConditioningInput::of_plans(batch.plans, state.clone(), steps, &model.manifest)?;
-        let prediction = compute_task(model, &context.task(inputs, batch.sees_points))?;
+        let prediction = compute_task(model, &context.task(inputs, batch.sees_occupancy))?;
         planner.record(prediction, asked.elapsed())?;
     }
     Ok(planner.finish())
@@ -51,6 +51,7 @@ mod tests {
 
     use super::*;
     use crate::frame::Frame;
+    use crate::nn::Occupancy;
     use crate::planning::PlanBatch;
     use crate::planning::{
         ActionLimit, CandidateKind, Goal, PlanCost, PlanSettings, SolverKind, SolverSettings, UnsafeReason,
@@ -110,7 +111,7 @@ mod tests {
 
     fn predicted(model: &Model, context: &PlanContext, batch: PlanBatch) -> Prediction {
         let inputs = ConditioningInput::of_plans(batch.plans, state(), Some(2), &model.manifest).unwrap();
-        compute_task(model, &context.task(inputs, batch.sees_points)).unwrap()
+        compute_task(model, &context.task(inputs, batch.sees_occupancy)).unwrap()
     }
 
     #[test]
@@ -169,11 +170,14 @@ mod tests {
         let mut planner = Planner::new(&model, blocked).unwrap();
         let context = context(&model);
         while let Some(batch) = planner.next_batch(&|| Duration::ZERO).unwrap() {
-            let sees = batch.sees_points;
+            let sees = batch.sees_occupancy;
             let mut prediction = predicted(&model, &context, batch);
             if sees {
                 let wall = (-20..20).flat_map(|left| [[0.3, left as f32 * 0.05, -0.1]; 3]);
-                prediction.points = wall.collect();
+                prediction.occupancy = Some(Occupancy {
+                    points: wall.collect(),
+                    movers: Vec::new(),
+                });
             }
             planner.record(prediction, Duration::ZERO).unwrap();
         }
@@ -201,7 +205,7 @@ mod tests {
         short.settings.budget = Some(Duration::from_millis(20));
         let mut planner = Planner::new(&model, short.clone()).unwrap();
         let first = planner.next_batch(&|| Duration::ZERO).unwrap().unwrap();
-        assert_eq!((first.plans.len(), first.sees_points), (1, true));
+        assert_eq!((first.plans.len(), first.sees_occupancy), (1, true));
         let none_judged = Planner::new(&model, short.clone()).unwrap().finish();
         assert_eq!(none_judged.unsafe_reason, Some(UnsafeReason::NoTime));
         assert_eq!(none_judged.best.kind, CandidateKind::Stop);

@@ -25,8 +25,8 @@ const DISTINCT: f32 = 0.1;
 pub struct PlanBatch {
     /// The plans.
     pub plans: Vec<Vec<Action>>,
-    /// Whether it also needs to know where what the last frame shows is.
-    pub sees_points: bool,
+    /// Whether it also needs to know what stands around the robot.
+    pub sees_occupancy: bool,
 }
 
 enum Phase {
@@ -135,8 +135,8 @@ impl Planner {
         let asked = std::mem::take(&mut self.asked);
         self.predicted += asked.len();
         self.rollout_s = self.rollout_s.max(took.as_secs_f64() / asked.len().max(1) as f64);
-        if !prediction.points.is_empty() {
-            self.judge.see(&prediction.points);
+        if let Some(occupancy) = &prediction.occupancy {
+            self.judge.see(occupancy);
         }
         let with_rollout = |(mut tried, rollout): (Tried, Rollout)| {
             tried.rollout = Some(rollout);
@@ -198,10 +198,7 @@ impl Planner {
             best,
             unsafe_reason,
             clearance_checked: self.judge.obstacles().is_some(),
-            obstacles_m: self
-                .judge
-                .obstacles()
-                .map_or_else(Vec::new, |seen| seen.places_m().to_vec()),
+            obstacles: self.judge.obstacles().cloned().unwrap_or_default(),
             samples: self.samples,
             predicted: self.predicted,
             iterations: self.iterations,
@@ -261,10 +258,10 @@ impl Planner {
         (left / (CAUTION * self.rollout_s).max(1e-9)) as usize
     }
 
-    fn ask(&mut self, tried: Vec<Tried>, sees_points: bool) -> PlanBatch {
+    fn ask(&mut self, tried: Vec<Tried>, sees_occupancy: bool) -> PlanBatch {
         let plans = tried.iter().map(|tried| self.judge.actions(&tried.plan)).collect();
         self.asked = tried;
-        PlanBatch { plans, sees_points }
+        PlanBatch { plans, sees_occupancy }
     }
 
     /// Judges plans, and keeps the good ones.

@@ -12,7 +12,7 @@ use super::task::{Features, Task};
 use crate::frame::warp::CameraModel;
 use crate::frame::{Frame, FrameError};
 use crate::nn::tensors::with_values;
-use crate::nn::{ConditioningTensors, ModelSpec, NnError};
+use crate::nn::{ConditioningTensors, ModelSpec, NnError, Occupancy};
 use crate::registry::Model;
 use crate::registry::calibration::{ContextStatistics, RolloutInContext};
 use crate::types::{Action, RobotState};
@@ -66,7 +66,7 @@ fn compute(loaded: &Model, tasks: &[&Task]) -> Result<Vec<Prediction>, Failure> 
             manifest: Arc::clone(&loaded.manifest),
             features,
             rollouts: Vec::new(),
-            points: Vec::new(),
+            occupancy: None,
             warnings: Vec::new(),
             timing: Timing::default(),
         });
@@ -78,8 +78,8 @@ fn compute(loaded: &Model, tasks: &[&Task]) -> Result<Vec<Prediction>, Failure> 
     let mut rollouts = windows.predict(&rows)?.into_iter();
     let mut window = 0;
     for (task, prediction) in tasks.iter().zip(&mut predictions) {
-        if task.sees_points && !task.conditioning_inputs.is_empty() {
-            prediction.points = windows.seen_points(window)?;
+        if task.sees_occupancy && !task.conditioning_inputs.is_empty() {
+            prediction.occupancy = windows.occupancy(window)?;
         }
         window += u32::from(!task.conditioning_inputs.is_empty());
         prediction.rollouts = rollouts.by_ref().take(task.conditioning_inputs.len()).collect();
@@ -177,11 +177,11 @@ impl<'a> Windows<'a> {
         })??)
     }
 
-    /// Where the points are that the last frame of a window shows; empty if the model estimates no depth.
-    fn seen_points(&self, window: u32) -> Result<Vec<[f32; 3]>, Failure> {
+    /// What stands around the robot at the last frame of a window, and where movers will be while it stops; `None` if the model
+    /// estimates no depth.
+    fn occupancy(&self, window: u32) -> Result<Option<Occupancy>, Failure> {
         let spec = self.loaded.spec();
         let inputs: Vec<&ConditioningInput> = self.tasks[window as usize].conditioning_inputs.iter().take(1).collect();
-        // The depth does not depend on the actions, but the network takes those of its whole horizon.
         let conditioning = ConditioningTensors {
             actions: spec
                 .action_inputs()
@@ -192,8 +192,8 @@ impl<'a> Windows<'a> {
             ..condition(spec, &inputs, inputs[0].steps(spec))?
         };
         let features = self.features.narrow(0, window as usize, 1)?.contiguous()?;
-        let points = self.loaded.network.seen_points(&features, &conditioning)?;
-        Ok(points.into_iter().next().unwrap_or_default())
+        let occupancy = self.loaded.network.occupancy(&features, &conditioning)?;
+        Ok(occupancy.and_then(|of_windows| of_windows.into_iter().next()))
     }
 
     /// The earlier states of the window of each row `[N, context - 1, S]`, NaN where they are not known; `None` if no

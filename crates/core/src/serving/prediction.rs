@@ -6,6 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use super::task::Features;
 use crate::frame::Frame;
+use crate::nn::Occupancy;
 use crate::registry::Manifest;
 use crate::registry::calibration::ExpectedError;
 
@@ -20,10 +21,10 @@ pub struct Prediction {
     pub features: Vec<Features>,
     /// One rollout for each conditioning input of the task, in order. A [`super::PredictionInput`] has one.
     pub rollouts: Vec<Rollout>,
-    /// Where the points are that the last frame shows, one for each pixel: ahead, left and up of the camera, in metres. Empty if
-    /// the task did not ask, or the model estimates no depth.
+    /// What stands around the robot, and where movers will be while it stops; `None` if the task did not ask, or the model
+    /// estimates no depth.
     #[doc(hidden)]
-    pub points: Vec<[f32; 3]>,
+    pub occupancy: Option<Occupancy>,
     /// Actions and states out of the range of the training.
     pub warnings: Vec<String>,
     /// How long it took.
@@ -46,7 +47,7 @@ impl Prediction {
     pub(super) fn append(&mut self, mut part: Self) {
         self.features.append(&mut part.features);
         self.rollouts.append(&mut part.rollouts);
-        self.points.append(&mut part.points);
+        self.occupancy = self.occupancy.take().or(part.occupancy);
         self.timing.queue_us += part.timing.queue_us;
         self.timing.compute_us += part.timing.compute_us;
     }

@@ -222,7 +222,7 @@ impl SessionState {
             warnings: Vec::new(),
             frames: vec![frame],
             conditioning_inputs: conditioning.filter(|_| is_full).into_iter().collect(),
-            sees_points: false,
+            sees_occupancy: false,
         }
     }
 
@@ -258,7 +258,7 @@ impl SessionState {
             warnings: Vec::new(),
             frames: Vec::new(),
             conditioning_inputs,
-            sees_points: false,
+            sees_occupancy: false,
         }
     }
 }

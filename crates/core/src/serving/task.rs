@@ -27,8 +27,8 @@ pub struct Task {
     pub(super) conditioning_inputs: Vec<ConditioningInput>,
     /// What of the input the model does not use.
     pub(super) warnings: Vec<String>,
-    /// Whether the answer tells where the points are that the last frame shows. It takes the first rollout's state.
-    pub(super) sees_points: bool,
+    /// Whether the answer tells what stands around the robot. It takes the first rollout's state.
+    pub(super) sees_occupancy: bool,
 }
 
 impl Task {
@@ -52,14 +52,14 @@ impl Task {
         })
     }
 
-    /// The same context with other rollouts. `sees_points`: the answer tells where the points are that the last frame shows, if
+    /// The same context with other rollouts. `sees_occupancy`: the answer tells what stands around the robot, if
     /// the model estimates depth and there is a rollout.
     #[doc(hidden)]
     #[must_use]
-    pub fn with_rollouts(&self, conditioning_inputs: Vec<ConditioningInput>, sees_points: bool) -> Self {
+    pub fn with_rollouts(&self, conditioning_inputs: Vec<ConditioningInput>, sees_occupancy: bool) -> Self {
         Self {
             conditioning_inputs,
-            sees_points,
+            sees_occupancy,
             ..self.clone()
         }
     }
@@ -77,7 +77,7 @@ impl Task {
             frames: std::mem::take(&mut self.frames),
             conditioning_inputs: std::mem::replace(&mut self.conditioning_inputs, later),
             warnings: Vec::new(),
-            sees_points: std::mem::take(&mut self.sees_points),
+            sees_occupancy: std::mem::take(&mut self.sees_occupancy),
         }
     }
 }

@@ -34,8 +34,17 @@ impl FrameContent {
 pub(super) enum FrameStore {
     Memory(Vec<Box<[u8]>>),
     File(Arc<FrameFile>),
-    /// Those of joined data sets, each with its first frame. Their masks are not among them.
-    Joined(Vec<(usize, FrameStore)>),
+    /// Those of joined data sets.
+    Joined(Vec<JoinedImages>),
+}
+
+/// The images of one of several joined data sets.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct JoinedImages {
+    /// Its first frame among those of all.
+    pub(super) first_frame: usize,
+    pub(super) frame_count: usize,
+    pub(super) images: FrameStore,
 }
 
 impl FrameStore {
@@ -44,9 +53,12 @@ impl FrameStore {
         match self {
             Self::Memory(images) => Ok(Cow::Borrowed(&images[image])),
             Self::File(file) => file.read(image).map(Cow::Owned),
-            Self::Joined(stores) => {
-                let (first, store) = &stores[stores.partition_point(|&(first, _)| first <= image) - 1];
-                store.read(image - first)
+            Self::Joined(parts) => {
+                let all = parts.last().map_or(0, |last| last.first_frame + last.frame_count);
+                let (frame, is_mask) = (image % all, image >= all);
+                let part = &parts[parts.partition_point(|part| part.first_frame <= frame) - 1];
+                let masks = if is_mask { part.frame_count } else { 0 };
+                part.images.read(masks + frame - part.first_frame)
             }
         }
     }
@@ -56,7 +68,7 @@ impl FrameStore {
         match self {
             Self::Memory(images) => images.iter().map(|image| image.len()).sum(),
             Self::File(_) => 0,
-            Self::Joined(stores) => stores.iter().map(|(_, store)| store.bytes_in_memory()).sum(),
+            Self::Joined(parts) => parts.iter().map(|part| part.images.bytes_in_memory()).sum(),
         }
     }
 }

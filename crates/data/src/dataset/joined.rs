@@ -2,7 +2,7 @@
 
 use sha2::{Digest, Sha256};
 
-use super::frame_store::{FrameContent, FrameStore};
+use super::frame_store::{FrameContent, FrameStore, JoinedImages};
 use super::{Dataset, DatasetError, DatasetInfo, DatasetPart, Episode};
 use foreframe_core::error_text::comma_separated;
 use foreframe_core::types::Channel;
@@ -13,7 +13,7 @@ const MAX_PERIOD_RATIO: f64 = 1.1;
 impl Dataset {
     /// Joins data sets, each with its weight: the share of a part is its weight over the sum of all. Frame size, frame period
     /// and channels are those of the first. The channels of the others are found by name and unit; those that the first does
-    /// not have are left out, and so are masks. One data set stays as it is. Errors: `Usage` if there is none, a weight is not
+    /// not have are left out, and masks unless all have them. One data set stays as it is. Errors: `Usage` if there is none, a weight is not
     /// above 0, a data set occurs twice, or sizes, periods or channels do not fit.
     pub fn join(mut weighted: Vec<(Self, f64)>) -> Result<Self, DatasetError> {
         check_weights(&weighted)?;
@@ -43,7 +43,11 @@ impl Dataset {
                 first_frame: first_frame + episode.first_frame,
                 ..episode
             }));
-            stores.push((first_frame, dataset.images));
+            stores.push(JoinedImages {
+                first_frame,
+                frame_count: dataset.info.frame_count,
+                images: dataset.images,
+            });
             parts.push(DatasetPart {
                 info: dataset.info,
                 episodes: from..episodes.len(),
@@ -53,7 +57,7 @@ impl Dataset {
         let names: Vec<&str> = parts.iter().map(|part| part.info.name.as_str()).collect();
         let info = DatasetInfo {
             name: names.join("+"),
-            has_masks: false,
+            has_masks: parts.iter().all(|part| part.info.has_masks),
             camera: first
                 .camera
                 .filter(|camera| parts.iter().all(|part| part.info.camera == Some(*camera))),

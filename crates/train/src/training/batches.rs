@@ -17,6 +17,7 @@ pub(super) struct FrameSource<'a> {
     preprocess: Preprocess,
     target: Preprocess,
     augmentation: Augmentation,
+    reads_masks: bool,
 }
 
 /// A window of a batch, and how it is changed.
@@ -56,6 +57,8 @@ pub(super) struct WindowBatch {
     pub(super) condition: ConditioningTensors,
     /// The states at the targets `[B, horizon, S]`, where the data set has states.
     pub(super) future_states: Option<Tensor>,
+    /// Where movers are in the last context frame and in the targets `[B, 1 + horizon, P]`, where the data set has masks.
+    pub(super) movers: Option<Tensor>,
 }
 
 impl<'a> FrameSource<'a> {
@@ -77,7 +80,13 @@ impl<'a> FrameSource<'a> {
             preprocess,
             target,
             augmentation,
+            reads_masks: false,
         }
+    }
+
+    /// The same source, whose batches also say where movers are, if the data set has masks.
+    pub(super) fn with_masks(self, reads_masks: bool) -> Self {
+        Self { reads_masks, ..self }
     }
 
     /// The data set.
@@ -120,6 +129,29 @@ impl<'a> FrameSource<'a> {
         Ok(Tensor::from_vec(values, (frames.len(), pixels), &Device::Cpu)?)
     }
 
+    /// Whether each pixel of the frames belongs to a mover `[N, P]`, 0 or 1; `None` without masks.
+    fn masks(&self, frames: &[(usize, WindowChange)]) -> Result<Option<Tensor>, TrainError> {
+        let info = self.dataset.info();
+        if !(info.has_masks && self.reads_masks) {
+            return Ok(None);
+        }
+        let mut values = Vec::with_capacity(frames.len() * info.frame_pixels());
+        for &(frame, change) in frames {
+            let Some(mask) = self.dataset.mask(frame)? else {
+                return Ok(None);
+            };
+            let from = values.len();
+            values.extend(mask.iter().map(|&robot| f32::from(u8::from(robot != 0))));
+            let change = WindowChange { gain: 1.0, ..change };
+            change.apply(&mut values[from..], info.frame_width_px as usize, false);
+        }
+        Ok(Some(Tensor::from_vec(
+            values,
+            (frames.len(), info.frame_pixels()),
+            &Device::Cpu,
+        )?))
+    }
+
     /// One batch of windows. `future` is made only if `with_future`.
     pub(super) fn windows(
         &self,
@@ -155,6 +187,10 @@ impl<'a> FrameSource<'a> {
                 cameras: self.dataset.cameras(windows.iter().map(|drawn| drawn.window.episode)),
             },
             future_states: self.channels(STATE, &future, &[windows.len(), horizon])?,
+            movers: self
+                .masks(&span(context - 1, 1 + horizon))?
+                .map(|masks| batched(masks, 1 + horizon))
+                .transpose()?,
         })
     }
 

@@ -201,6 +201,9 @@ pub struct SequenceConfig {
     /// the measured poses, if the states have a pose.
     #[serde(default)]
     pub motion_weight: f64,
+    /// Weight of the loss of movers (flow network with `movers`): the cross entropy of where they are and will be.
+    #[serde(default)]
+    pub movers_weight: f64,
 }
 
 impl SequenceConfig {

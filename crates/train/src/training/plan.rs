@@ -71,10 +71,12 @@ impl<'a> TrainingPlan<'a> {
         let spec = config.model_spec(dataset, &frames);
         check_channels(dataset, &spec)?;
         check_actions(config, dataset, &spec)?;
+        check_movers(config, dataset, &spec)?;
         spec.validate()?;
         let augmentation = Augmentation::new(&config.data, dataset, &frames, config.seed)?;
         Ok(Self {
-            source: FrameSource::new(dataset, spec.preprocess, config.sequence.target, augmentation),
+            source: FrameSource::new(dataset, spec.preprocess, config.sequence.target, augmentation)
+                .with_masks(finds_movers(&spec)),
             spec,
             train,
             mixture,
@@ -193,6 +195,33 @@ fn check_actions(config: &TrainConfig, dataset: &Dataset, spec: &ModelSpec) -> R
         has_actions: !spec.actions.is_empty(),
         conditioning: spec.conditioning,
     })
+}
+
+fn finds_movers(spec: &ModelSpec) -> bool {
+    spec.flow().is_some_and(|flow| flow.layers.movers)
+}
+
+/// Errors: `Config` if the model is to find movers, and nothing tells where they are.
+fn check_movers(config: &TrainConfig, dataset: &Dataset, spec: &ModelSpec) -> Result<(), TrainError> {
+    if !finds_movers(spec) {
+        return Ok(());
+    }
+    let refused = |reason: String| Err(TrainError::Config(reason));
+    if !dataset.info().has_masks {
+        return refused(format!(
+            "data set \"{}\" has no masks of movers, but model.flow.movers is true; collected data sets have them; set \
+             model.flow.movers to false",
+            dataset.info().name
+        ));
+    }
+    if config.sequence.movers_weight == 0.0 {
+        return refused(
+            "sequence.movers_weight is 0, but model.flow.movers is true; it must be above 0, or nothing would be learned of \
+             movers"
+                .to_owned(),
+        );
+    }
+    Ok(())
 }
 
 /// The distinct frames of windows of `length` frames, in increasing order.

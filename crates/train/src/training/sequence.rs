@@ -11,6 +11,7 @@ use super::shuffle::Shuffle;
 use super::stage::{BatchPart, Objective};
 use foreframe_core::frame::Frame;
 use foreframe_core::nn::loss::Loss;
+use foreframe_core::nn::mask_loss::mask_loss;
 use foreframe_core::nn::ssim_loss::ssim_loss;
 use foreframe_core::nn::{Feedback, Network, Parameters};
 
@@ -72,6 +73,10 @@ impl<'a> SequenceObjective<'a> {
         {
             let motion = Loss::Mse.between(&predicted.motion, &truth)?;
             loss = (loss + (motion * sequence.motion_weight)?)?;
+        }
+        if let (Some(movers), Some(truth)) = (&predicted.movers, &batch.movers) {
+            let truth = truth.narrow(1, 0, 1 + counting)?.contiguous()?;
+            loss = (loss + (mask_loss(movers, &truth)? * sequence.movers_weight)?)?;
         }
         Ok(loss)
     }

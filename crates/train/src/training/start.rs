@@ -5,9 +5,13 @@ use super::plan::TrainingPlan;
 use foreframe_core::error_text::comma_separated;
 use foreframe_core::nn::Parameters;
 use foreframe_core::registry::StoredWeights;
+use foreframe_core::types::Seed;
 
-/// The weights of another model. Errors: `OtherNetwork` if they do not fit this training's network, `OtherUnits`.
-pub(super) fn parameters(plan: &TrainingPlan<'_>, start: &StoredWeights) -> Result<Parameters, TrainError> {
+/// Prefix of the names of the tensors that find movers.
+const MOVERS_PREFIX: &str = "flow.movers.";
+
+/// The weights of another model; if only this training's network finds movers, what finds them is random. Errors: `OtherNetwork` if they do not fit this training's network, `OtherUnits`.
+pub(super) fn parameters(plan: &TrainingPlan<'_>, start: &StoredWeights, seed: Seed) -> Result<Parameters, TrainError> {
     let (from, to) = (&start.manifest.spec, &plan.spec);
     let used = [
         ("action", to.action_inputs(), &from.actions, &to.actions),
@@ -32,7 +36,15 @@ pub(super) fn parameters(plan: &TrainingPlan<'_>, start: &StoredWeights) -> Resu
             });
         }
     }
-    let tensors = start.parameters.snapshot()?;
+    let mut tensors = start.parameters.snapshot()?;
+    if let (Some(from), Some(to)) = (from.flow(), to.flow())
+        && to.layers.movers
+        && !from.layers.movers
+    {
+        // What finds movers is new.
+        let initial = Parameters::initialize(&plan.spec, seed)?.snapshot()?;
+        tensors.extend(initial.into_iter().filter(|(name, _)| name.starts_with(MOVERS_PREFIX)));
+    }
     Parameters::from_tensors(&plan.spec, tensors).map_err(|source| TrainError::OtherNetwork {
         model: start.manifest.name.clone(),
         source,

@@ -7,8 +7,10 @@ use super::blocks::sampled_blocks;
 use super::depth_head::{DepthHead, SeenPlaces};
 use super::depth_views::DepthViews;
 use super::network::{FlowNetwork, FlowPrediction, Surroundings};
+use super::occupancy::{Occupancy, OccupancyView};
 use super::reprojection::{Reprojection, reproject};
 use super::rollout_rows::RolloutRows;
+use crate::frame::warp::CameraModel;
 use crate::nn::conditioning::ConditioningTensors;
 use crate::nn::error::NnError;
 use crate::nn::ops::compose::{Composition, RoomPlaces};
@@ -23,32 +25,75 @@ pub(super) struct SeenDepths {
     coarse: Tensor,
     /// Of each pixel of the last frames `[contexts, P]`, in metres.
     depths: Tensor,
+    /// Where movers are in the last frames, as logits `[contexts, P]`.
+    movers: Option<Tensor>,
+}
+
+/// Where the frames after contexts are seen from, and the decoder's state of each.
+struct SeenAhead {
+    context_of: Vec<u32>,
+    /// `[M, P, PLACE_VALUES]`.
+    places: Tensor,
+    seen: SeenPlaces,
+    /// `[M, H/4, W/4, C]`.
+    state: Tensor,
 }
 
 impl FlowNetwork {
-    /// The points that the last frames of B windows `[B, context, P]` show, one for each pixel: ahead, left and up of each
-    /// camera, in metres. Empty if this form estimates no depth. Errors: `Shape`, `Missing`.
-    pub(in crate::nn) fn seen_points(
+    /// What stands around the robot at the last frames of B windows `[B, context, P]`, and where movers will be under each
+    /// window's actions; `None` if this form estimates no depth. Errors: `Shape`, `Missing`.
+    pub(in crate::nn) fn occupancy(
         &self,
         frames: &Tensor,
         conditioning: &ConditioningTensors,
-    ) -> Result<Vec<Vec<[f32; 3]>>, NnError> {
+    ) -> Result<Option<Vec<Occupancy>>, NnError> {
         let Surroundings::Seen(head) = &self.surroundings else {
-            return Ok(Vec::new());
+            return Ok(None);
         };
         let windows: Vec<u32> = (0..frames.dim(0)? as u32).collect();
         let rows = RolloutRows::new(&self.spec, frames, &windows, conditioning)?;
-        let SeenDepths { views, depths, .. } = self.see_depth(&rows, head)?;
-        let points = with_values(&depths, |depths| {
-            let of_frames = depths.chunks_exact(self.spec.pixels()).zip(&views.viewers);
-            of_frames
-                .map(|(depths, viewer)| {
-                    let points = viewer.rays().into_iter().zip(depths);
-                    points.map(|(ray, depth)| ray.map(|part| part * depth)).collect()
-                })
-                .collect()
-        })?;
-        Ok(points)
+        let all = windows.iter().map(|&window| {
+            let window = window as usize;
+            self.occupancy_of(&rows.part(window..window + 1), head)
+        });
+        all.collect::<Result<_, NnError>>().map(Some)
+    }
+
+    /// Of one rollout.
+    fn occupancy_of(&self, row: &RolloutRows, head: &DepthHead) -> Result<Occupancy, NnError> {
+        let (size, horizon) = (self.spec.image_size(), self.spec.horizon);
+        let depths = self.see_depth(row, head)?;
+        let camera = row.camera(0).unwrap_or(CameraModel::USUAL);
+        let view = OccupancyView {
+            viewer: depths.views.viewers[0],
+            size,
+            height_m: camera.height_m.unwrap_or(CameraModel::USUAL_HEIGHT_M),
+        };
+        let Some((layers, seen)) = self.movers.as_ref().zip(depths.movers.as_ref()) else {
+            return Ok(Occupancy {
+                points: with_values(&depths.depths, |depths| view.points(depths, None))?,
+                movers: Vec::new(),
+            });
+        };
+        let motion = self.motion.forward(row)?;
+        let ahead = self.see_ahead(row, horizon, &depths, &motion)?;
+        let coming = layers.coming(&ahead.state)?;
+        let motions = motion.flatten_all()?.to_vec1::<f32>()?;
+        let logits = Tensor::cat(&[seen, &coming], 0)?;
+        Ok(with_values(&logits, |logits| {
+            let motions = std::iter::once([0.0; 3]).chain(motions.as_chunks::<3>().0.iter().copied());
+            let frames = logits.chunks_exact(size.pixels());
+            let movers = frames
+                .clone()
+                .zip(motions)
+                .map(|(logits, motion)| view.movers(logits, motion));
+            Ok::<_, NnError>(Occupancy {
+                movers: movers.collect(),
+                points: with_values(&depths.depths, |depths| {
+                    view.points(depths, logits.get(..size.pixels()))
+                })?,
+            })
+        })??)
     }
 
     /// Encodes the contexts of the rollouts and estimates their depths.
@@ -58,19 +103,24 @@ impl FlowNetwork {
         let features = self.encode(contexts.count(), std::mem::take(&mut views.inputs))?;
         let depths = head.forward(&features, &views)?;
         let [coarse, _] = features;
-        Ok(SeenDepths { views, coarse, depths })
+        let movers = self.movers.as_ref().map(|movers| movers.seen(&coarse)).transpose()?;
+        Ok(SeenDepths {
+            views,
+            coarse,
+            depths,
+            movers,
+        })
     }
 
-    /// All steps of the rollouts at once; gives the frames of the first `steps`.
-    pub(super) fn predict_with_depth(
+    /// What the first `steps` frames of the rollouts are computed from.
+    fn see_ahead(
         &self,
         rows: &RolloutRows,
         steps: usize,
-        SeenDepths { views, coarse, depths }: &SeenDepths,
-    ) -> Result<FlowPrediction, NnError> {
+        depths: &SeenDepths,
+        motion: &Tensor,
+    ) -> Result<SeenAhead, NnError> {
         let (size, horizon) = (self.spec.image_size(), self.spec.horizon);
-        let motion = self.motion.forward(rows)?;
-
         // Frames that are not asked for are not computed.
         let of_steps = |&context: &u32| std::iter::repeat_n(context, steps);
         let context_of: Vec<u32> = rows.context_of().iter().flat_map(of_steps).collect();
@@ -80,15 +130,46 @@ impl FlowNetwork {
         };
         let reprojection = Reprojection {
             size,
-            viewers: views.viewers.clone(),
+            viewers: depths.views.viewers.clone(),
             context_of: context_of.clone(),
         };
-        let places = reproject(reprojection, depths, &asked(&motion)?)?;
+        let places = reproject(reprojection, &depths.depths, &asked(motion)?)?;
         let seen = with_values(&places, |places| SeenPlaces::of(places, size))?;
-        let warped = sample_features(coarse, seen.coarse.clone(), &context_of)?;
-        let mixed = Tensor::cat(&[&warped, &seen.beside_features(views, &context_of, size)?], 3)?;
-        let state = per_place(&self.mix, &mixed)?;
-        let state = self.refined(state, &asked(&self.modulate(rows, &motion)?)?)?;
+        let warped = sample_features(&depths.coarse, seen.coarse.clone(), &context_of)?;
+        let beside = seen.beside_features(&depths.views, &context_of, size)?;
+        let state = per_place(&self.mix, &Tensor::cat(&[&warped, &beside], 3)?)?;
+        let state = self.refined(state, &asked(&self.modulate(rows, motion)?)?)?;
+        Ok(SeenAhead {
+            context_of,
+            places,
+            seen,
+            state,
+        })
+    }
+
+    /// All steps of the rollouts at once; gives the frames of the first `steps`.
+    pub(super) fn predict_with_depth(
+        &self,
+        rows: &RolloutRows,
+        steps: usize,
+        depths: &SeenDepths,
+    ) -> Result<FlowPrediction, NnError> {
+        let (size, views) = (self.spec.image_size(), &depths.views);
+        let motion = self.motion.forward(rows)?;
+        let SeenAhead {
+            context_of,
+            places,
+            seen,
+            state,
+        } = self.see_ahead(rows, steps, depths, &motion)?;
+        let movers = match (&self.movers, &depths.movers) {
+            (Some(head), Some(seen)) => {
+                let seen = seen.index_select(&Tensor::new(rows.context_of(), &Device::Cpu)?, 0)?;
+                let coming = head.coming(&state)?.reshape((rows.count(), steps, ()))?;
+                Some(Tensor::cat(&[&seen.unsqueeze(1)?, &coming], 1)?)
+            }
+            _ => None,
+        };
         let moved = sampled_blocks(&views.frames, &context_of, &seen.room, size)?;
         let head = self.head(&state, &moved, &seen.beside_pixels(views, &context_of, size)?)?;
 
@@ -113,6 +194,7 @@ impl FlowNetwork {
             frames: frames.reshape((rows.count(), steps, size.pixels()))?,
             scene: None,
             motion,
+            movers,
         })
     }
 }

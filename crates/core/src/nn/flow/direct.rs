@@ -81,6 +81,7 @@ impl FlowNetwork {
             frames: frames.reshape(shape)?.narrow(1, 0, steps)?,
             scene: Some(content_frames(&scene)?.reshape(shape)?),
             motion,
+            movers: None,
         })
     }
 

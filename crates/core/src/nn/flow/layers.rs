@@ -133,6 +133,10 @@ fn layer_sizes(spec: &ModelSpec, flow: &FlowSpec) -> Vec<LayerSize> {
             half,
         );
     }
+    if sizes.movers {
+        layer("movers.seen", channels, FRAME_CHANNELS, quarter);
+        layer("movers.coming", channels, FRAME_CHANNELS, horizon * quarter);
+    }
     layer(
         mix_name(sizes),
         channels + mixed_beside(sizes),

@@ -5,6 +5,7 @@ use candle_core::{Device, Tensor};
 use super::depth_head::DepthHead;
 use super::layers::mix_name;
 use super::motion::MotionHead;
+use super::mover_head::MoverHead;
 use super::rollout_rows::RolloutRows;
 use super::scene::Scene;
 use crate::nn::error::NnError;
@@ -25,6 +26,9 @@ pub struct FlowPrediction {
     pub scene: Option<Tensor>,
     /// How the camera will have moved since the last frame: yaw, ahead, left `[N, horizon, 3]`, in radians and metres.
     pub motion: Tensor,
+    /// Where movers are in the last frame and will be in each predicted one, as logits `[N, 1 + steps, P]`; `None` where the model
+    /// does not tell.
+    pub movers: Option<Tensor>,
 }
 
 /// What the network knows of the surroundings.
@@ -46,6 +50,7 @@ pub(in crate::nn) struct FlowNetwork {
     blocks: Vec<[Convolution3; 2]>,
     pub(super) surroundings: Surroundings,
     pub(super) motion: MotionHead,
+    pub(super) movers: Option<MoverHead>,
     modulation: [Linear; 2],
     pub(super) mix: Linear,
     refine: Vec<[Convolution3; 2]>,
@@ -78,6 +83,7 @@ impl FlowNetwork {
                 Surroundings::Remembered(Scene::new(&spec, sizes.camera, tensors))
             },
             motion: MotionHead::new(&spec, &sizes, tensors),
+            movers: layers.movers.then(|| MoverHead::new(tensors)),
             modulation: ["inputs", "output"].map(|part| tensors.linear(&format!("flow.modulation.{part}"))),
             mix: tensors.linear(&format!("flow.{}", mix_name(layers))),
             refine: (0..layers.decoder_blocks)
@@ -106,6 +112,9 @@ impl FlowNetwork {
             linear.pack()?;
         }
         self.motion.pack()?;
+        if let Some(movers) = &mut self.movers {
+            movers.pack()?;
+        }
         match &mut self.surroundings {
             Surroundings::Remembered(scene) => scene.pack(),
             Surroundings::Seen(depth) => depth.pack(),

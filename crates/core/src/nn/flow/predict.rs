@@ -76,10 +76,14 @@ fn in_parts(
     let parts = parts.par_drain(..).map(|part| predict(&rows.part(part)));
     let parts = parts.collect::<Result<Vec<FlowPrediction>, NnError>>()?;
     let joined = |of: fn(&FlowPrediction) -> &Tensor| Tensor::cat(&parts.iter().map(of).collect::<Vec<_>>(), 0);
-    let scenes: Vec<&Tensor> = parts.iter().filter_map(|part| part.scene.as_ref()).collect();
+    let if_given = |of: fn(&FlowPrediction) -> Option<&Tensor>| {
+        let given: Vec<&Tensor> = parts.iter().filter_map(of).collect();
+        (!given.is_empty()).then(|| Tensor::cat(&given, 0)).transpose()
+    };
     Ok(FlowPrediction {
         frames: joined(|part| &part.frames)?,
-        scene: (!scenes.is_empty()).then(|| Tensor::cat(&scenes, 0)).transpose()?,
+        scene: if_given(|part| part.scene.as_ref())?,
         motion: joined(|part| &part.motion)?,
+        movers: if_given(|part| part.movers.as_ref())?,
     })
 }

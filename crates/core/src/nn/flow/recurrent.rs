@@ -72,6 +72,7 @@ impl FlowNetwork {
             frames: Tensor::stack(&frames, 1)?,
             scene: Some(content.broadcast_as((count, horizon, size.pixels()))?.contiguous()?),
             motion,
+            movers: None,
         })
     }
 }

@@ -43,6 +43,9 @@ pub struct FlowLayers {
     /// Whether the depth of what the last frame shows is estimated from the context under its known motion, and the camera
     /// moved through it, instead of remembering what one place looks like. Such a model reads no absolute pose.
     pub depth: bool,
+    /// Whether it also tells where movers are: other robots, in the last frame and in each predicted one. Only with `depth`;
+    /// training needs masks of them.
+    pub movers: bool,
     /// Whether each step continues from the state and the frame of the step before it, instead of starting from the last
     /// true frame. Only for models that take no actions.
     pub recurrent: bool,
@@ -60,13 +63,14 @@ impl Default for FlowLayers {
             scene_hidden: 48,
             frames_read: 3,
             depth: false,
+            movers: false,
             recurrent: false,
         }
     }
 }
 
 impl FlowSpec {
-    /// Errors: `Camera`, `RecurrentActions`, `RecurrentDepth`, `FrameSides` and those of the layers, for a model with this conditioning and frames of this width and height.
+    /// Errors: `Camera`, `RecurrentActions`, `RecurrentDepth`, `MoversDepth`, `FrameSides` and those of the layers, for a model with this conditioning and frames of this width and height.
     pub(super) fn check(&self, conditioning: Conditioning, sides_px: [u32; 2]) -> Result<(), NnError> {
         if let Some(camera) = &self.camera {
             camera.validate().map_err(NnError::Camera)?;
@@ -77,6 +81,9 @@ impl FlowSpec {
         }
         if self.layers.recurrent && self.layers.depth {
             return Err(NnError::RecurrentDepth);
+        }
+        if self.layers.movers && !self.layers.depth {
+            return Err(NnError::MoversDepth);
         }
         let [least, most] = SIDES_PX;
         let fits = |side: u32| (least..=most).contains(&side) && side.is_multiple_of(least);

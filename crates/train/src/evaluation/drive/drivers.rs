@@ -127,11 +127,8 @@ impl<'a> EpisodeDriver<'a> {
         let plans = vec![vec![action([0.0, 0.0])?; spec.horizon]];
         let inputs = ConditioningInput::of_plans(plans, state.clone(), None, &model.manifest)?;
         let seen = compute_task(model, &context(model, now)?.task(inputs, true))?;
-        let obstacles = Obstacles::new(
-            &seen.points,
-            now.camera.height_m,
-            PlanSettings::default().robot_height_m,
-        );
+        let seen = seen.occupancy.unwrap_or_default();
+        let obstacles = Obstacles::new(&seen, now.camera.height_m, PlanSettings::default().robot_height_m).as_now();
         let state = state
             .filter(|_| spec.state_inputs().is_some())
             .map_or_else(Vec::new, Vec::from);

@@ -38,6 +38,7 @@ impl TrainConfig {
             ("sequence.short_share", sequence.short_share, 0.9),
             ("sequence.scene_weight", sequence.scene_weight, 100.0),
             ("sequence.motion_weight", sequence.motion_weight, 100.0),
+            ("sequence.movers_weight", sequence.movers_weight, 100.0),
             ("data.brightness", self.data.brightness, 0.9),
             ("data.crop", self.data.crop, 0.5),
             ("run.final_learning_rate", run.final_learning_rate, 1.0),
