@@ -15,15 +15,15 @@ use foreframe_train::evaluation::drive::{self, DriveScore, DriveSettings, Driver
 /// Let robots drive to goals in the simulator, with several drivers in the same episodes.
 ///
 /// The drivers: pid drives straight to the goal and sees nothing; stop does the same, but stands while the model's depth network sees
-/// something on its way; plan follows the plan that the model finds, anew at every frame; simulator plans with the simulator itself as
-/// the model, the upper limit. Goals can be reached on a straight line, but for the other robots. All drivers know where the
+/// something on its way; plan follows the plan that the model finds, anew at every frame; velocity does the same, but expects movers
+/// to go on as fast as in the last frames; simulator plans with the simulator itself as the model, the upper limit. Goals can be reached on a straight line, but for the other robots. All drivers know where the
 /// goal is. The table has means over the episodes with 95 % bootstrap intervals.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   foreframe drive --scenario crowded --episodes 50 --driver pid,simulator
-  foreframe drive --scenario crowded --rooms varied --model rooms --driver stop,plan --json")]
+  foreframe drive --scenario crossing --rooms varied --model rooms --driver stop,velocity,plan --json")]
 pub(super) struct DriveArgs {
-    /// The scenario: moving-observer or crowded
+    /// The scenario: moving-observer, crowded or crossing
     #[arg(long, default_value = "crowded")]
     scenario: Scenario,
     /// Each episode in a room of its own from that set: varied, new-materials or new-cameras [default: the same room]
@@ -35,10 +35,10 @@ pub(super) struct DriveArgs {
     /// The same seed gives the same episodes and goals
     #[arg(long, default_value_t = 0)]
     seed: u64,
-    /// The drivers: pid, stop, plan, simulator
+    /// The drivers: pid, stop, velocity, plan, simulator
     #[arg(long = "driver", value_delimiter = ',', required = true)]
     drivers: Vec<DriverKind>,
-    /// For the drivers stop and plan: the directory of a model, its name, or NAME@VERSION
+    /// For the drivers stop, velocity and plan: the directory of a model, its name, or NAME@VERSION
     #[arg(long)]
     model: Option<String>,
     /// Longest time of an episode, in seconds

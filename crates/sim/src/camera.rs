@@ -109,16 +109,47 @@ impl Camera {
         Ok((frame, samples.iter().map(|sample| sample.robot_id).collect()))
     }
 
-    /// Casts one ray through each pixel's center, then more rays at edges.
-    fn render(&self, room: &Room, robots: &[RenderedRobot]) -> Vec<RaySample> {
-        let views = &View {
+    /// The depth of what each pixel's center shows, along the camera's axis, in metres.
+    pub(super) fn depths(&self, room: &Room, robots: &[RenderedRobot]) -> Vec<f32> {
+        let views = &self.view(room, robots);
+        let places = (0..self.height).flat_map(|row| (0..self.width).map(move |column| (column, row)));
+        places
+            .map(|(column, row)| {
+                let direction = self.direction(column as f32 + 0.5, row as f32 + 0.5);
+                let (mut hit, _) = self.cast_sides(room, direction);
+                for piece in &views.pieces {
+                    self.cast_piece(piece, direction, &mut hit);
+                }
+                for view in &views.robots {
+                    view.cast(direction, &mut hit);
+                }
+                hit.time
+            })
+            .collect()
+    }
+
+    fn view<'a>(&self, room: &'a Room, robots: &'a [RenderedRobot]) -> View<'a> {
+        View {
             room,
             pieces: self.visible_pieces(room),
             robots: robots
                 .iter()
                 .map(|robot| RobotView::new(robot, self.position))
                 .collect(),
-        };
+        }
+    }
+
+    /// The direction of a point of the image; 1 long along the camera's axis.
+    #[inline]
+    fn direction(&self, column: f32, row: f32) -> Vector {
+        let right = (column - self.width as f32 / 2.0) * self.pixel_m;
+        let down = (row - self.height as f32 / 2.0) * self.pixel_m;
+        self.forward - self.left * right - self.up * down
+    }
+
+    /// Casts one ray through each pixel's center, then more rays at edges.
+    fn render(&self, room: &Room, robots: &[RenderedRobot]) -> Vec<RaySample> {
+        let views = &self.view(room, robots);
         let places = (0..self.height).flat_map(|row| (0..self.width).map(move |column| (column, row)));
         let centers: Vec<RaySample> = places
             .map(|(column, row)| self.sample(views, column as f32 + 0.5, row as f32 + 0.5))
@@ -165,9 +196,7 @@ impl Camera {
 
     /// Casts the ray through a point of the image and shades the point that it hits.
     fn sample(&self, views: &View, column: f32, row: f32) -> RaySample {
-        let right = (column - self.width as f32 / 2.0) * self.pixel_m;
-        let down = (row - self.height as f32 / 2.0) * self.pixel_m;
-        let direction = self.forward - self.left * right - self.up * down;
+        let direction = self.direction(column, row);
         let (mut hit, mut surface) = self.cast_sides(views.room, direction);
         for piece in &views.pieces {
             if let Some(part) = self.cast_piece(piece, direction, &mut hit) {

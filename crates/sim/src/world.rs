@@ -252,11 +252,11 @@ impl World {
         gap_m(&self.physics, &self.room)
     }
 
-    /// A place for Tb1 to drive to: free, at least `least_m` away, and with a straight way that nothing stands on. Of several, one
-    /// at random; `None` if there is none. Robots do not count.
+    /// A place for Tb1 to drive to: free, at least `least_m` away, not farther than `aside_rad` from straight ahead, and with a
+    /// straight way that nothing stands on. Of several, one at random; `None` if there is none. Robots do not count.
     #[must_use]
     #[doc(hidden)]
-    pub fn draw_goal(&self, seed: Seed, least_m: f32) -> Option<[f32; 2]> {
+    pub fn draw_goal(&self, seed: Seed, least_m: f32, aside_rad: f32) -> Option<[f32; 2]> {
         let mut random = seed.rng();
         let here = arena::position(self.physics.pose(0));
         let radius = self.physics.radius_m(0);
@@ -270,6 +270,7 @@ impl World {
             })
             .find(|&place| {
                 arena::distance(here, place) >= least_m
+                    && arena::bearing(self.physics.pose(0), place).abs() <= aside_rad
                     && self.room.is_clear(place, radius + GOAL_MARGIN_M)
                     && self.room.is_way_free(here, place, radius + WAY_MARGIN_M)
             })
@@ -295,15 +296,22 @@ impl World {
 
     /// Renders the current camera image and its segmentation mask again: the same bytes as in [`World::observe`].
     pub fn render(&self) -> Result<(Frame, Vec<u8>), SimError> {
-        let robots: Vec<RenderedRobot> = self
-            .others
-            .iter()
-            .zip(self.other_robot_poses())
-            .zip(1..)
-            .map(|((robot, pose), id)| RenderedRobot::new(robot.appearance, robot.tint, pose, id))
-            .collect();
         let noise = self.parameters.stream("noise", self.frame_index);
-        self.camera().capture(&self.room, &robots, noise)
+        self.camera().capture(&self.room, &self.rendered_robots(), noise)
+    }
+
+    /// How far away what each pixel shows is, along the camera's axis, in metres.
+    #[must_use]
+    #[doc(hidden)]
+    pub fn depths(&self) -> Vec<f32> {
+        self.camera().depths(&self.room, &self.rendered_robots())
+    }
+
+    fn rendered_robots(&self) -> Vec<RenderedRobot> {
+        let robots = self.others.iter().zip(self.other_robot_poses()).zip(1..);
+        robots
+            .map(|((robot, pose), id)| RenderedRobot::new(robot.appearance, robot.tint, pose, id))
+            .collect()
     }
 
     /// Simulates one frame period with this action. Commands beyond Tb1's limits are clamped to [`super::robot::MAX_LINEAR_M_S`] and

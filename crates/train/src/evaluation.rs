@@ -23,10 +23,12 @@ mod novelty_scale;
 mod output;
 pub mod plans;
 mod progress;
+mod replay;
 pub mod report;
 mod score;
 pub mod skill;
 mod statistics;
+pub mod surroundings;
 pub mod uncertainty;
 mod verdict;
 mod windows;
@@ -200,6 +202,7 @@ fn score_split(
         scores.actions = Some(actions::table(&errors, &group_of, &bootstrap));
         scores.plans = Some(plans::identify(evaluation, &windows)?);
     }
+    scores.surroundings = surroundings::measure(evaluation, &windows)?;
     let mut novelty = Vec::new();
     if let Some(calibration) = &loaded.manifest.calibration {
         let (measured, found) = uncertainty::measure(evaluation, calibration, &windows)?;

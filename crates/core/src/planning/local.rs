@@ -6,6 +6,7 @@ use super::choice::PlanChoice;
 use super::error::PlanError;
 use super::judge::PlannerInput;
 use super::planner::Planner;
+use crate::nn::Occupancy;
 use crate::registry::Model;
 use crate::serving::{ConditioningInput, Task, compute_task};
 
@@ -31,6 +32,16 @@ impl PlanContext {
 /// Searches for the best plan from a context, as long as the budget allows. Errors: what does not fit the model, and what the
 /// computation fails with.
 pub fn plan(model: &Model, context: &PlanContext, input: PlannerInput) -> Result<PlanChoice, PlanError> {
+    plan_around(model, context, input, &mut |_| {})
+}
+
+/// As [`plan`], around what `change` makes of what the network sees and expects. Errors: as [`plan`].
+pub fn plan_around(
+    model: &Model,
+    context: &PlanContext,
+    input: PlannerInput,
+    change: &mut dyn FnMut(&mut Occupancy),
+) -> Result<PlanChoice, PlanError> {
     let begun = Instant::now();
     let state = input.state.clone();
     let mut planner = Planner::new(model, input)?;
@@ -38,7 +49,10 @@ pub fn plan(model: &Model, context: &PlanContext, input: PlannerInput) -> Result
     while let Some(batch) = planner.next_batch(&|| begun.elapsed())? {
         let asked = Instant::now();
         let inputs = ConditioningInput::of_plans(batch.plans, state.clone(), steps, &model.manifest)?;
-        let prediction = compute_task(model, &context.task(inputs, batch.sees_occupancy))?;
+        let mut prediction = compute_task(model, &context.task(inputs, batch.sees_occupancy))?;
+        if let Some(occupancy) = &mut prediction.occupancy {
+            change(occupancy);
+        }
         planner.record(prediction, asked.elapsed())?;
     }
     Ok(planner.finish())
@@ -51,7 +65,6 @@ mod tests {
 
     use super::*;
     use crate::frame::Frame;
-    use crate::nn::Occupancy;
     use crate::planning::PlanBatch;
     use crate::planning::{
         ActionLimit, CandidateKind, Goal, PlanCost, PlanSettings, SolverKind, SolverSettings, UnsafeReason,
@@ -176,7 +189,7 @@ mod tests {
                 let wall = (-20..20).flat_map(|left| [[0.3, left as f32 * 0.05, -0.1]; 3]);
                 prediction.occupancy = Some(Occupancy {
                     points: wall.collect(),
-                    movers: Vec::new(),
+                    ..Occupancy::default()
                 });
             }
             planner.record(prediction, Duration::ZERO).unwrap();

@@ -122,7 +122,7 @@ mod tests {
         let lamp = [[0.3, 0.0, 0.8]; 3];
         let seen = Occupancy {
             points: wall.chain(floor).chain(lamp).collect(),
-            movers: Vec::new(),
+            ..Occupancy::default()
         };
         let obstacles = Obstacles::new(&seen, Some(0.5), 0.6);
         assert!((obstacles.clearance_m([0.0, 0.0], 0, 0.2) - 0.825).abs() < 0.03);
@@ -137,8 +137,8 @@ mod tests {
     #[test]
     fn a_mover_is_in_the_way_only_while_it_is_there() {
         let seen = Occupancy {
-            points: Vec::new(),
             movers: vec![vec![[1.0, -0.5]], vec![[1.0, 0.0]], vec![[1.0, 0.5]]],
+            ..Occupancy::default()
         };
         let obstacles = Obstacles::new(&seen, None, 0.6);
         let ahead = |metres: f32| [0.0, metres, 0.0];

@@ -1,12 +1,16 @@
 //! The closed loop: robots that drive to a goal among others in the simulator, with several drivers, all in the same episodes.
 //!
-//! `error` → `settings` → `drivers` (what chooses the commands) → `episode` → `scores`.
+//! `error` → `settings` → `situation` (what is known at a frame) → `tracks`, `simulated` → `drivers` (what chooses the commands) → `episode`
+//! → `scores`.
 
 mod drivers;
 mod episode;
 mod error;
 mod scores;
 mod settings;
+mod simulated;
+mod situation;
+mod tracks;
 
 use foreframe_core::registry::Model;
 

@@ -73,6 +73,42 @@ impl<'a> Inference<'a> {
         })
     }
 
+    /// Where movers are in each window's last context frame and in the frames to come, as logits; `None` if the model does not tell.
+    /// Errors: those of the network.
+    pub(super) fn movers(&self, windows: &[Window]) -> Result<Option<Vec<f32>>, EvaluationError> {
+        let (context, condition) = (
+            self.contexts(windows)?,
+            self.condition(windows, ActionSource::Recorded)?,
+        );
+        let horizon = self.spec().horizon;
+        let predicted = self.loaded.network.predict_flow(&context, &condition, horizon)?;
+        predicted
+            .and_then(|predicted| predicted.movers)
+            .as_ref()
+            .map(values)
+            .transpose()
+    }
+
+    /// The depth of each pixel of a window's last context frame, as estimated and before anything is learned, in metres; `None`
+    /// if the model estimates none. Errors: those of the network.
+    pub(super) fn depths(&self, window: Window) -> Result<Option<[Vec<f32>; 2]>, EvaluationError> {
+        let (context, condition) = (
+            self.contexts(&[window])?,
+            self.condition(&[window], ActionSource::Recorded)?,
+        );
+        let occupancy = self.loaded.network.occupancy(&context, &condition)?;
+        let first = occupancy.and_then(|of_windows| of_windows.into_iter().next());
+        Ok(first.map(|occupancy| [occupancy.depths_m, occupancy.first_depths_m]))
+    }
+
+    /// The codes of the frames that each window shows, `[windows, context, code]`.
+    fn contexts(&self, windows: &[Window]) -> Result<Tensor, EvaluationError> {
+        let spec = self.spec();
+        let seen = self.encode(&self.frames(windows, 0..spec.context)?)?;
+        let shape = (windows.len(), spec.context, spec.code_len());
+        Ok(Tensor::from_vec(seen, shape, &Device::Cpu)?)
+    }
+
     /// Frames of windows as the model reconstructs them from the codes of the frames seen, in the model's space. Empty if it
     /// does not reconstruct. Errors: those of the network.
     pub(super) fn reconstruct(&self, seen: &[f32]) -> Result<Vec<f32>, EvaluationError> {

@@ -10,20 +10,19 @@ use super::EvaluationError;
 use super::bootstrap::{Interval, TrialSums};
 use super::inference::{ActionSource, Inference};
 use super::progress::{EvaluationContext, EvaluationStage};
-use super::windows::{evenly, true_frame};
+use super::replay::{action, replayed};
+use super::windows::evenly;
 use foreframe_core::frame::preprocess::scale;
 use foreframe_core::frame::quality;
 use foreframe_core::nn::ModelSpec;
-use foreframe_core::types::{Action, Seed};
+use foreframe_core::types::Seed;
 use foreframe_data::dataset::Window;
-use foreframe_sim::{World, WorldConfig};
+use foreframe_sim::WorldConfig;
 
 /// Plans at each context: the one that was carried out, and those of other windows.
 const PLANS: usize = 8;
 /// Contexts at most, evenly spread over the windows.
 const MAX_CONTEXTS: usize = 60;
-/// A replayed frame that differs by more than this mean squared error is not the recorded one.
-const REPLAY_TOLERANCE: f64 = 1e-4;
 
 /// How often plans were identified, or why that was not measured.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -130,27 +129,16 @@ fn futures_of(
     context: Window,
     plans: &[Window],
 ) -> Result<Futures, EvaluationError> {
-    let (dataset, spec) = (inference.dataset, inference.spec());
-    let episode = &dataset.episodes()[context.episode];
-    let Some(trial) = &episode.trial else {
-        return Ok(None);
-    };
-    let last = context.first_frame + spec.context - 1;
-    let recorded = true_frame(dataset, last)?;
-    let action = |frame: usize| Action::try_from(dataset.action(frame).to_vec()).map_err(EvaluationError::Action);
+    let spec = inference.spec();
     let mut futures = Vec::with_capacity(plans.len());
     for plan in plans {
-        let mut branch = World::from_parameters(trial.clone(), world)?;
-        for frame in episode.first_frame..last {
-            branch.step(&action(frame)?)?;
-        }
-        if quality::mse(&scale(branch.observe().frame.pixels()), &recorded) > REPLAY_TOLERANCE {
+        let Some(mut branch) = replayed(inference, world, context)? else {
             return Ok(None);
-        }
+        };
         let first_action = plan.first_frame + spec.context - 1;
         let mut future = Vec::with_capacity(spec.horizon * spec.pixels());
         for frame in first_action..first_action + spec.horizon {
-            let result = branch.step(&action(frame)?)?;
+            let result = branch.step(&action(inference.dataset, frame)?)?;
             future.extend(scale(result.observation.frame.pixels()));
         }
         futures.push(future);

@@ -17,6 +17,8 @@ pub enum EvaluationStage {
     Actions,
     /// Plan identification.
     Plans,
+    /// Where movers are, and how far away things are.
+    Surroundings,
     /// Expected errors and novelty.
     Calibration,
 }
@@ -29,6 +31,7 @@ impl EvaluationStage {
             Self::Scores => "scores",
             Self::Actions => "actions",
             Self::Plans => "plans",
+            Self::Surroundings => "surroundings",
             Self::Calibration => "calibration",
         }
     }

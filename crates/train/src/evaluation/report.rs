@@ -13,6 +13,7 @@ use super::metrics::{MethodScores, StepCurve, WindowScores, summarize};
 use super::plans::PlanOutcome;
 use super::progress::EvaluationContext;
 use super::skill::{Skill, skill};
+use super::surroundings::SurroundingsScores;
 use super::uncertainty::{NoveltyScores, UncertaintyScores};
 use foreframe_core::registry::{DatasetStamp, Model, ProgramStamp};
 use foreframe_core::types::{ModelName, Seed};
@@ -278,6 +279,9 @@ pub struct SetScores {
     /// How often plans are identified by their predictions. Absent for a model that takes no actions.
     #[serde(default)]
     pub plans: Option<PlanOutcome>,
+    /// Where movers are, and how far away things are. Absent for a model that does not tell.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub surroundings: Option<SurroundingsScores>,
     /// How well the expected errors fit. Absent for a model without calibration.
     #[serde(default)]
     pub uncertainty: Option<UncertaintyScores>,
@@ -304,6 +308,7 @@ impl SetScores {
             reconstruction_mse: StepCurve::new(by_trial(|window| &window.reconstruction_mse).means()),
             actions: None,
             plans: None,
+            surroundings: None,
             uncertainty: None,
             samples: SampleWindow::choose(windows),
         }

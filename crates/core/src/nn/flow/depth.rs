@@ -69,10 +69,15 @@ impl FlowNetwork {
             size,
             height_m: camera.height_m.unwrap_or(CameraModel::USUAL_HEIGHT_M),
         };
+        let known = Occupancy {
+            depths_m: depths.depths.flatten_all()?.to_vec1::<f32>()?,
+            first_depths_m: depths.views.depths.clone(),
+            ..Occupancy::default()
+        };
         let Some((layers, seen)) = self.movers.as_ref().zip(depths.movers.as_ref()) else {
             return Ok(Occupancy {
-                points: with_values(&depths.depths, |depths| view.points(depths, None))?,
-                movers: Vec::new(),
+                points: view.points(&known.depths_m, None),
+                ..known
             });
         };
         let motion = self.motion.forward(row)?;
@@ -87,13 +92,12 @@ impl FlowNetwork {
                 .clone()
                 .zip(motions)
                 .map(|(logits, motion)| view.movers(logits, motion));
-            Ok::<_, NnError>(Occupancy {
+            Occupancy {
                 movers: movers.collect(),
-                points: with_values(&depths.depths, |depths| {
-                    view.points(depths, logits.get(..size.pixels()))
-                })?,
-            })
-        })??)
+                points: view.points(&known.depths_m, logits.get(..size.pixels())),
+                ..known
+            }
+        })?)
     }
 
     /// Encodes the contexts of the rollouts and estimates their depths.

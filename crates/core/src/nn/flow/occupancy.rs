@@ -22,6 +22,10 @@ pub struct Occupancy {
     /// Where movers touch the floor in the last frame, then after each step that is predicted: metres ahead and to the left. Empty
     /// if the model does not find movers.
     pub movers: Vec<Vec<[f32; 2]>>,
+    /// The depth of each pixel of the last frame along the camera's axis, in metres.
+    pub depths_m: Vec<f32>,
+    /// The same before anything is learned: a wall around the camera, and the floor.
+    pub first_depths_m: Vec<f32>,
 }
 
 /// One camera's view of a room.

@@ -1,22 +1,26 @@
 //! One episode with one driver.
 
 use std::collections::VecDeque;
+use std::f32::consts::PI;
 use std::time::Instant;
 
 use serde::{Deserialize, Serialize};
 
-use super::drivers::{EpisodeDriver, Situation};
+use super::drivers::EpisodeDriver;
 use super::error::DriveError;
 use super::settings::{DriveSettings, DriverKind};
+use super::situation::Situation;
 use foreframe_core::frame::warp::CameraModel;
 use foreframe_core::registry::Model;
 use foreframe_core::types::Action;
-use foreframe_sim::{World, WorldConfig};
+use foreframe_sim::{Scenario, World, WorldConfig};
 
 /// The robot has arrived at this distance from its goal, in metres.
 const ARRIVAL_M: f32 = 0.25;
 /// The goal is at least this far away, in metres.
 const LEAST_GOAL_M: f32 = 1.5;
+/// In `crossing`, the goal is not farther than this from straight ahead, in radians.
+const CROSSED_RAD: f32 = 0.35;
 /// Without a model, the robot stands for this many frames, as others stand until their model's context is full.
 const CONTEXT: usize = 5;
 /// Commands below this are standing, in m/s.
@@ -80,8 +84,16 @@ impl EpisodeStart {
         }
         let world = World::new(settings.scenario, &config, settings.seed, episode as u64)?;
         let seed = settings.seed.derive("goal", episode as u64);
-        let goal = world.draw_goal(seed, LEAST_GOAL_M);
-        let goal = goal.or_else(|| world.draw_goal(seed, LEAST_GOAL_M / 2.0));
+        // Robots cross the way ahead.
+        let aside_rad = if settings.scenario == Scenario::Crossing {
+            CROSSED_RAD
+        } else {
+            PI
+        };
+        let tries = [(LEAST_GOAL_M, aside_rad), (LEAST_GOAL_M, PI), (LEAST_GOAL_M / 2.0, PI)];
+        let goal = tries
+            .into_iter()
+            .find_map(|(least_m, aside_rad)| world.draw_goal(seed, least_m, aside_rad));
         let own = world.parameters().room.as_ref();
         let own = own.map(|room| room.camera.model_with_height());
         Ok(Self {

@@ -25,14 +25,22 @@ pub enum DriveError {
         /// The model.
         model: ModelName,
     },
+    /// A driver that follows movers.
+    #[error("driver {driver} needs a model that finds movers; model \"{model}\" does not")]
+    NoMovers {
+        /// The driver.
+        driver: &'static str,
+        /// The model.
+        model: ModelName,
+    },
     /// The robot with the camera stands still there.
-    #[error("in {scenario}, the robot with the camera does not drive; choose moving-observer or crowded")]
+    #[error("in {scenario}, the robot with the camera does not drive; choose moving-observer, crowded or crossing")]
     Standing {
         /// The scenario.
         scenario: Scenario,
     },
     /// No driver.
-    #[error("drivers is empty; name at least one of pid, stop, plan and simulator")]
+    #[error("drivers is empty; name at least one of pid, stop, velocity, plan and simulator")]
     NoDriver,
     /// The actions of the model are not those of the robot.
     #[error(

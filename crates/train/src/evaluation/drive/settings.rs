@@ -18,6 +18,8 @@ pub enum DriverKind {
     Pid,
     /// As `pid`, but stands while the model's depth network sees something on its way within the next second.
     Stop,
+    /// As `plan`, but movers are expected to go on as fast as in the last frames, instead of as the model predicts.
+    Velocity,
     /// Follows the plan that the model finds, and plans anew at every frame.
     Plan,
     /// Plans with the simulator itself as the model: it knows where everything will be. The upper limit.
@@ -26,7 +28,7 @@ pub enum DriverKind {
 
 impl DriverKind {
     /// All drivers.
-    pub const ALL: [Self; 4] = [Self::Pid, Self::Stop, Self::Plan, Self::Simulator];
+    pub const ALL: [Self; 5] = [Self::Pid, Self::Stop, Self::Velocity, Self::Plan, Self::Simulator];
 
     /// Its name.
     #[must_use]
@@ -34,6 +36,7 @@ impl DriverKind {
         match self {
             Self::Pid => "pid",
             Self::Stop => "stop",
+            Self::Velocity => "velocity",
             Self::Plan => "plan",
             Self::Simulator => "simulator",
         }
@@ -45,7 +48,7 @@ impl FromStr for DriverKind {
 
     fn from_str(name: &str) -> Result<Self, String> {
         let found = Self::ALL.into_iter().find(|driver| driver.name() == name);
-        found.ok_or_else(|| format!("there is no driver {name:?}; there are: pid, stop, plan, simulator"))
+        found.ok_or_else(|| format!("there is no driver {name:?}; there are: pid, stop, velocity, plan, simulator"))
     }
 }
 
@@ -83,7 +86,7 @@ impl Default for DriveSettings {
 }
 
 impl DriveSettings {
-    /// Errors: `Standing`, `NoDriver`, `NoModel`, `NoDepth`, `OtherRobot`.
+    /// Errors: `Standing`, `NoDriver`, `NoModel`, `NoDepth`, `NoMovers`, `OtherRobot`.
     pub(super) fn check(&self, model: Option<&Model>) -> Result<(), DriveError> {
         if !self.scenario.observer_drives() {
             return Err(DriveError::Standing {
@@ -94,7 +97,7 @@ impl DriveSettings {
             return Err(DriveError::NoDriver);
         }
         for &driver in &self.drivers {
-            if !matches!(driver, DriverKind::Stop | DriverKind::Plan) {
+            if !matches!(driver, DriverKind::Stop | DriverKind::Velocity | DriverKind::Plan) {
                 continue;
             }
             let Some(model) = model else {
@@ -111,6 +114,12 @@ impl DriveSettings {
             let fits = fits && (spec.state_inputs().is_none() || units(&spec.states) == own(state_channels()));
             if !fits {
                 return Err(DriveError::OtherRobot { model: name() });
+            }
+            if driver == DriverKind::Velocity && !spec.flow().is_some_and(|flow| flow.layers.movers) {
+                return Err(DriveError::NoMovers {
+                    driver: driver.name(),
+                    model: name(),
+                });
             }
             if driver == DriverKind::Stop && !spec.flow().is_some_and(|flow| flow.layers.depth) {
                 return Err(DriveError::NoDepth {

@@ -1,0 +1,72 @@
+//! What a driver knows at a frame, and what stands in its way.
+
+use std::collections::VecDeque;
+
+use super::error::DriveError;
+use foreframe_core::frame::Frame;
+use foreframe_core::frame::warp::CameraModel;
+use foreframe_core::nn::Occupancy;
+use foreframe_core::planning::{ActionLimit, PlanContext};
+use foreframe_core::registry::Model;
+use foreframe_core::serving::{ConditioningInput, Task, compute_task};
+use foreframe_core::types::{Action, RobotState};
+use foreframe_sim::World;
+
+/// Limits of the commands, those of the recorded drives: m/s and rad/s.
+pub(super) const LIMITS: [ActionLimit; 2] = [
+    ActionLimit {
+        low: 0.0,
+        high: 0.5,
+        max_change: None,
+    },
+    ActionLimit {
+        low: -0.8,
+        high: 0.8,
+        max_change: None,
+    },
+];
+/// The distance that planning drivers keep, in metres.
+pub(super) const MARGIN_M: f32 = 0.15;
+
+/// What a driver knows at a frame.
+pub(super) struct Situation<'a> {
+    /// The world, for the driver `simulator`.
+    pub(super) world: &'a World,
+    /// The frames of the model's context, oldest first.
+    pub(super) frames: &'a VecDeque<Frame>,
+    /// The states at them.
+    pub(super) states: &'a VecDeque<RobotState>,
+    /// The camera.
+    pub(super) camera: CameraModel,
+    /// The goal as seen from the robot: metres ahead and to the left.
+    pub(super) goal_m: [f32; 2],
+    /// The number of the frame.
+    pub(super) frame: u64,
+}
+
+impl Situation<'_> {
+    /// The context of predictions.
+    pub(super) fn context(&self, model: &Model) -> Result<PlanContext, DriveError> {
+        let frames = self.frames.iter().cloned().collect();
+        let past = self
+            .states
+            .iter()
+            .take(self.states.len().saturating_sub(1))
+            .cloned()
+            .collect();
+        let task = Task::rollout(frames, past, Some(self.camera), Vec::new(), &model.manifest)?;
+        Ok(PlanContext::new(task))
+    }
+
+    /// What the model sees around the robot, and where it expects movers.
+    pub(super) fn occupancy(&self, model: &Model) -> Result<Occupancy, DriveError> {
+        let plans = vec![vec![action([0.0, 0.0])?; model.spec().horizon]];
+        let inputs = ConditioningInput::of_plans(plans, self.states.back().cloned(), None, &model.manifest)?;
+        let seen = compute_task(model, &self.context(model)?.task(inputs, true))?;
+        Ok(seen.occupancy.unwrap_or_default())
+    }
+}
+
+pub(super) fn action(command: [f32; 2]) -> Result<Action, DriveError> {
+    Ok(Action::try_from(command.to_vec())?)
+}

@@ -1,0 +1,224 @@
+//! How well a model tells what stands around the robot: where movers are and will be, and how far away things are.
+
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+use super::EvaluationError;
+use super::metrics::StepCurve;
+use super::progress::{EvaluationContext, EvaluationStage};
+use super::replay::replayed;
+use super::windows::evenly;
+use foreframe_data::dataset::Window;
+
+/// Contexts at most whose depth is compared, evenly spread over the windows.
+const MAX_DEPTH_CONTEXTS: usize = 60;
+/// A mover with at least this many pixels in the last frame is visible there.
+const VISIBLE_PIXELS: usize = 8;
+
+/// What a model tells of the surroundings, against the truth of the simulator.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct SurroundingsScores {
+    /// Where movers are and will be; absent for a model that does not find movers, and without masks.
+    pub movers: Option<MoverScores>,
+    /// How far away things are; absent where the simulator cannot tell.
+    pub depth: Option<DepthScores>,
+}
+
+/// The masks of movers.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct MoverScores {
+    /// In the last frame.
+    pub now: MaskScore,
+    /// Recall of the pixels of movers at each step.
+    pub recall: StepCurve,
+    /// The same, only of movers that the last frame shows.
+    pub recall_of_visible: StepCurve,
+    /// Pixels that are predicted and true over those that are one of both, at each step.
+    pub iou: StepCurve,
+}
+
+/// The score of the masks of one step.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct MaskScore {
+    /// Share of the true pixels that are found.
+    pub recall: f64,
+    /// Pixels that are found and true over those that are one of both.
+    pub iou: f64,
+}
+
+/// The depth of what the last frame shows, but for movers.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct DepthScores {
+    /// Frames that were compared.
+    pub frames: usize,
+    /// Median over all pixels of |depth − truth| / truth.
+    pub median_relative_error: f64,
+    /// The same before anything is learned: a wall around the camera, and the floor.
+    pub before_learning: f64,
+}
+
+/// Pixels of one step's masks.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+struct MaskCounts {
+    found: usize,
+    truth: usize,
+    both: usize,
+    visible: usize,
+    visible_found: usize,
+}
+
+impl MaskCounts {
+    /// `seen`: for each robot's id, whether it is visible in the last frame.
+    fn add(&mut self, logits: &[f32], mask: &[u8], seen: &[bool; 256]) {
+        for (&logit, &robot) in logits.iter().zip(mask) {
+            let (is_found, is_true) = (logit > 0.0, robot != 0);
+            self.found += usize::from(is_found);
+            self.truth += usize::from(is_true);
+            self.both += usize::from(is_found && is_true);
+            let is_visible = is_true && seen[usize::from(robot)];
+            self.visible += usize::from(is_visible);
+            self.visible_found += usize::from(is_visible && is_found);
+        }
+    }
+
+    fn score(self) -> MaskScore {
+        MaskScore {
+            recall: ratio(self.both, self.truth),
+            iou: ratio(self.both, self.found + self.truth - self.both),
+        }
+    }
+}
+
+/// 1 where there is nothing to find.
+fn ratio(part: usize, whole: usize) -> f64 {
+    if whole == 0 { 1.0 } else { part as f64 / whole as f64 }
+}
+
+/// Measures a model on these windows; `None` if it tells nothing of the surroundings. Errors: those of the network and the
+/// simulator, `Cancelled`.
+pub(super) fn measure(
+    evaluation: &EvaluationContext,
+    windows: &[Window],
+) -> Result<Option<SurroundingsScores>, EvaluationError> {
+    let flow = evaluation.inference.spec().flow();
+    if !flow.is_some_and(|flow| flow.layers.depth) {
+        return Ok(None);
+    }
+    Ok(Some(SurroundingsScores {
+        movers: movers(evaluation, windows)?,
+        depth: depth(evaluation, windows)?,
+    }))
+}
+
+fn movers(evaluation: &EvaluationContext, windows: &[Window]) -> Result<Option<MoverScores>, EvaluationError> {
+    let (inference, spec) = (evaluation.inference, evaluation.inference.spec());
+    let dataset = inference.dataset;
+    let (info, pixels) = (dataset.info(), spec.pixels());
+    if !info.has_masks || info.frame_pixels() != pixels {
+        return Ok(None);
+    }
+    let mut counts = vec![MaskCounts::default(); 1 + spec.horizon];
+    let mut done = 0;
+    for batch in windows.chunks(evaluation.config.batch) {
+        let Some(logits) = inference.movers(batch)? else {
+            return Ok(None);
+        };
+        for (window, logits) in batch.iter().zip(logits.chunks_exact(counts.len() * pixels)) {
+            let last = window.first_frame + spec.context - 1;
+            let mut seen = [false; 256];
+            for (step, (counts, logits)) in counts.iter_mut().zip(logits.chunks_exact(pixels)).enumerate() {
+                let Some(mask) = dataset.mask(last + step)? else {
+                    return Ok(None);
+                };
+                if step == 0 {
+                    seen = visible(&mask);
+                }
+                counts.add(logits, &mask, &seen);
+            }
+        }
+        done += batch.len();
+        evaluation.report(EvaluationStage::Surroundings, done, windows.len())?;
+    }
+    let curve = |of: fn(MaskCounts) -> f64| StepCurve::new(counts.iter().skip(1).map(|&counts| of(counts)).collect());
+    Ok(Some(MoverScores {
+        now: counts[0].score(),
+        recall: curve(|counts| counts.score().recall),
+        recall_of_visible: curve(|counts| ratio(counts.visible_found, counts.visible)),
+        iou: curve(|counts| counts.score().iou),
+    }))
+}
+
+/// For each robot's id, whether a mask shows it.
+fn visible(mask: &[u8]) -> [bool; 256] {
+    let mut pixels = [0; 256];
+    for &robot in mask {
+        pixels[usize::from(robot)] += 1;
+    }
+    pixels.map(|count| count >= VISIBLE_PIXELS)
+}
+
+fn depth(evaluation: &EvaluationContext, windows: &[Window]) -> Result<Option<DepthScores>, EvaluationError> {
+    let inference = evaluation.inference;
+    let (dataset, spec) = (inference.dataset, inference.spec());
+    let is_same_size = dataset.info().frame_pixels() == spec.pixels();
+    let Some(world) = dataset.info().world.as_ref().filter(|_| is_same_size) else {
+        return Ok(None);
+    };
+    let contexts = evenly(windows, MAX_DEPTH_CONTEXTS);
+    let errors = contexts.par_iter().map(|&window| -> Result<_, EvaluationError> {
+        let Some(replay) = replayed(inference, world, window)? else {
+            return Ok(None);
+        };
+        let Some([estimated, before]) = inference.depths(window)? else {
+            return Ok(None);
+        };
+        let (truth, mask) = (replay.depths(), replay.observe().mask);
+        let relative = |estimated: &[f32]| -> Vec<f64> {
+            let pixels = estimated
+                .iter()
+                .zip(&truth)
+                .zip(&mask)
+                .filter(|(_, robot)| **robot == 0);
+            pixels
+                .map(|((estimated, truth), _)| f64::from((estimated - truth).abs() / truth))
+                .collect()
+        };
+        Ok(Some([relative(&estimated), relative(&before)]))
+    });
+    let Some(errors) = errors.collect::<Result<Option<Vec<[Vec<f64>; 2]>>, EvaluationError>>()? else {
+        return Ok(None);
+    };
+    let median = |which: usize| {
+        let mut all: Vec<f64> = errors.iter().flat_map(|errors| &errors[which]).copied().collect();
+        all.sort_by(f64::total_cmp);
+        all.get(all.len() / 2).copied().unwrap_or(f64::NAN)
+    };
+    Ok(Some(DepthScores {
+        frames: contexts.len(),
+        median_relative_error: median(0),
+        before_learning: median(1),
+    }))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn masks_are_counted_by_pixels() {
+        let mut mask = vec![0, 0, 0, 0, 2, 2];
+        mask.extend([1; 8]);
+        let seen = visible(&mask);
+        assert!(seen[1] && !seen[2]);
+        let mut logits = vec![1.0, -1.0, -1.0, -1.0, 1.0, -1.0];
+        logits.extend([1.0; 6]);
+        logits.extend([-1.0; 2]);
+        let mut counts = MaskCounts::default();
+        counts.add(&logits, &mask, &seen);
+        assert_eq!((counts.found, counts.truth, counts.both), (8, 10, 7));
+        assert_eq!((counts.visible, counts.visible_found), (8, 6));
+        let MaskScore { recall, iou } = counts.score();
+        assert!((recall - 0.7).abs() < 1e-12 && (iou - 7.0 / 11.0).abs() < 1e-12);
+        assert_eq!(MaskCounts::default().score(), MaskScore { recall: 1.0, iou: 1.0 });
+    }
+}
