@@ -188,6 +188,7 @@ fn fan(args: &PlanArgs, goal: &Goal, choice: &PlanChoice) -> PlanFan {
             .map(|way| way.iter().map(|[_, ahead, left]| [*ahead, *left]).collect())
             .collect(),
         obstacles_m: choice.obstacles.fixed_m().to_vec(),
+        movers_m: choice.obstacles.movers_m().to_vec(),
         goal_m: goal.position_m,
         radius_m: args.radius,
     }

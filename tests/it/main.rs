@@ -55,6 +55,7 @@ mod malformed_streams;
 mod metrics;
 mod mixture;
 mod model_cards;
+mod movers;
 mod moving_mnist;
 mod msgpack;
 mod next_commands;

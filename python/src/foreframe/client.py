@@ -310,7 +310,8 @@ class Client:
             time.sleep(EVENTS_PAUSE_S)
 
     def environment(self, scenario: str, *, seed: int = 0, world: Mapping[str, Any] | None = None) -> Environment:
-        """A simulated robot on the server: ``static-observer``, ``moving-observer`` or ``crowded``."""
+        """A simulated robot on the server: ``static-observer``, ``moving-observer``, ``crowded`` or
+        ``crossing``."""
         return Environment(self, scenario, seed, world)
 
 

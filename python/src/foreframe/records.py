@@ -251,7 +251,8 @@ class Plan(PlannedActions):
     #: Whether the plan is safe, as far as it was checked; otherwise ``reason`` says why not.
     safe: bool
     reason: str | None
-    #: Whether the way was checked against what the model's depth network sees in the last frame.
+    #: Whether the way was checked against what the model's depth network sees in the last frame, and against where movers will
+    #: be, if it finds them.
     clearance_checked: bool
     novelty: float | None
     #: Plans that were judged, and those whose frames were predicted.

@@ -19,6 +19,10 @@ pub(super) fn json(manifest: &Manifest, choice: &PlanChoice) -> Value {
         "safe": choice.unsafe_reason.is_none(),
         "reason": choice.unsafe_reason,
         "clearance_checked": choice.clearance_checked,
+        "obstacles": {
+            "fixed_m": choice.obstacles.fixed_m(),
+            "movers_m": choice.obstacles.movers_m(),
+        },
         "samples": choice.samples,
         "predicted": choice.predicted,
         "iterations": choice.iterations,

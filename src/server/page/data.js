@@ -52,7 +52,7 @@ function DataSet({ dataset, models, parameters }) {
   </section>`;
 }
 
-const SCENARIOS = ["moving-observer", "static-observer", "crowded"];
+const SCENARIOS = ["moving-observer", "static-observer", "crowded", "crossing"];
 
 function NewData() {
   const [job_id, setJob] = useState(null);

@@ -36,7 +36,7 @@ pub(in crate::server) fn routes() -> OpenApiRouter<App> {
 #[derive(Debug, Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
 struct NewEnvironment {
-    /// `static-observer`, `moving-observer` or `crowded`.
+    /// `static-observer`, `moving-observer`, `crowded` or `crossing`.
     scenario: Scenario,
     /// The seed of the sequence of trials; the same seed and actions give the same frames.
     #[serde(default)]

@@ -15,8 +15,8 @@ use foreframe_core::frame::Frame;
 use foreframe_core::frame::resize::Resize;
 use foreframe_core::frame::warp::CameraModel;
 use foreframe_core::planning::{
-    ActionLimit, CandidateKind, Goal, PlanCandidate, PlanChoice, PlanContext, PlanCost, PlanSettings, PlannerInput,
-    SolverSettings, UnsafeReason,
+    ActionLimit, CandidateKind, Goal, Obstacles, PlanCandidate, PlanChoice, PlanContext, PlanCost, PlanSettings,
+    PlannerInput, SolverSettings, UnsafeReason,
 };
 use foreframe_core::registry::Manifest;
 use foreframe_core::serving::{SessionState, Task};
@@ -117,6 +117,9 @@ pub(super) struct PlanRequest {
     /// Whether the answer has the predicted frames.
     #[serde(default)]
     with_frames: bool,
+    /// Whether the answer has what stands in the way, and where movers will be.
+    #[serde(default)]
+    with_obstacles: bool,
 }
 
 /// A goal for the robot of a session.
@@ -140,6 +143,9 @@ pub(super) struct SessionPlanRequest {
     /// Whether the answer has the predicted frames.
     #[serde(default)]
     with_frames: bool,
+    /// Whether the answer has what stands in the way, and where movers will be.
+    #[serde(default)]
+    with_obstacles: bool,
 }
 
 /// How an answer is given.
@@ -148,6 +154,7 @@ pub(super) struct PlanAnswerForm {
     pub(super) wanted: ResponseFormat,
     format: ImageFormat,
     with_frames: bool,
+    with_obstacles: bool,
 }
 
 impl WithFrames for PlanRequest {
@@ -162,6 +169,7 @@ impl PlanRequest {
             wanted,
             format: self.format.answer(),
             with_frames: self.with_frames,
+            with_obstacles: self.with_obstacles,
         }
     }
 
@@ -197,6 +205,7 @@ impl SessionPlanRequest {
             wanted,
             format: self.format.answer(),
             with_frames: self.with_frames,
+            with_obstacles: self.with_obstacles,
         }
     }
 
@@ -349,9 +358,12 @@ pub(super) struct PlanResponse {
     /// The same in words.
     #[serde(skip_serializing_if = "Option::is_none")]
     detail: Option<String>,
-    /// Whether the way was checked against what the depth network sees in the last frame. It knows nothing of what is beside or behind
-    /// the camera, nor of where things move.
+    /// Whether the way was checked against what the depth network sees in the last frame, and, if the model finds movers, against
+    /// where they will be. It knows nothing of what is beside or behind the camera.
     clearance_checked: bool,
+    /// What stands in the way; absent unless it was asked for and checked.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    obstacles: Option<ObstaclesBody>,
     /// How unlike the training data frames, state and the plan are, 0…1; absent if the model is not calibrated, or nothing was predicted.
     #[serde(skip_serializing_if = "Option::is_none")]
     novelty: Option<f32>,
@@ -365,6 +377,25 @@ pub(super) struct PlanResponse {
     format: ImageFormat,
     /// How long the search took, in milliseconds.
     time_ms: f64,
+}
+
+/// What a robot would touch: places in metres ahead and to the left of the robot now, in cells of 5 cm.
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+#[schema(as = PlanObstacles)]
+struct ObstaclesBody {
+    /// What stands.
+    fixed_m: Vec<[f32; 2]>,
+    /// Movers now, then after each step that is predicted; empty if the model does not find movers.
+    movers_m: Vec<Vec<[f32; 2]>>,
+}
+
+impl From<&Obstacles> for ObstaclesBody {
+    fn from(obstacles: &Obstacles) -> Self {
+        Self {
+            fixed_m: obstacles.fixed_m().to_vec(),
+            movers_m: obstacles.movers_m().to_vec(),
+        }
+    }
 }
 
 impl PlanResponse {
@@ -388,6 +419,7 @@ impl PlanResponse {
             reason: choice.unsafe_reason,
             detail: choice.unsafe_reason.map(|reason| reason.to_string()),
             clearance_checked: choice.clearance_checked,
+            obstacles: (form.with_obstacles && choice.clearance_checked).then(|| (&choice.obstacles).into()),
             novelty,
             samples: choice.samples,
             predicted: choice.predicted,

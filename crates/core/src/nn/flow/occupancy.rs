@@ -9,6 +9,8 @@ use crate::nn::ops::sampling::ImageSize;
 pub(super) const MOVER_PROBABILITY: f32 = 0.5;
 /// Pixels of a column, one above the other, that make a mover. One alone is more often an error.
 const LEAST_PIXELS: usize = 2;
+/// Columns to each side whose mover counts as the same.
+const COLUMNS_BESIDE: usize = 2;
 /// How far a mover reaches away from the camera behind its nearest side, in metres.
 const MOVER_DEPTH_M: f32 = 0.3;
 /// Places of a mover from its nearest side to its farthest.
@@ -50,29 +52,35 @@ impl OccupancyView {
         let rays = self.viewer.rays();
         let moved = CameraPose::default().moved(motion);
         let (sin, cos) = moved.heading.sin_cos();
+        let nearest: Vec<Option<[f32; 2]>> = (0..self.size.width)
+            .map(|column| self.nearest(&rays, logits, column))
+            .collect();
         let mut places = Vec::new();
-        for column in 0..self.size.width {
-            let pixel = |row: usize| row * self.size.width + column;
-            let is_mover = |row: usize| probability(logits[pixel(row)]) >= MOVER_PROBABILITY;
-            let lowest = (LEAST_PIXELS - 1..self.size.height)
-                .rev()
-                .find(|&row| (row + 1 - LEAST_PIXELS..=row).all(is_mover));
-            let Some(row) = lowest else { continue };
-            // Where the mover ends and the floor begins.
-            let below = rays[pixel((row + 1).min(self.size.height - 1))];
-            let [ahead, left, up] = std::array::from_fn(|axis| 0.5 * (rays[pixel(row)][axis] + below[axis]));
-            if up >= 0.0 {
-                continue;
-            }
-            let near = self.height_m / -up;
-            let length = ahead.hypot(left);
+        for (column, place) in nearest.iter().enumerate() {
+            let Some([ahead, left]) = *place else { continue };
+            // At its sides, a mover often ends above the floor.
+            let beside = column.saturating_sub(COLUMNS_BESIDE)..(column + COLUMNS_BESIDE + 1).min(nearest.len());
+            let distances = nearest[beside].iter().flatten().map(|[ahead, left]| ahead.hypot(*left));
+            let (near, length) = (distances.fold(f32::INFINITY, f32::min), ahead.hypot(left));
             for nth in 0..PLACES_DEEP {
-                let deeper = MOVER_DEPTH_M * nth as f32 / (PLACES_DEEP - 1) as f32;
-                let [ahead, left] = [ahead, left].map(|part| part * (near + deeper / length));
+                let distance = near + MOVER_DEPTH_M * nth as f32 / (PLACES_DEEP - 1) as f32;
+                let [ahead, left] = [ahead, left].map(|part| part * distance / length);
                 places.push([moved.x + cos * ahead - sin * left, moved.y + sin * ahead + cos * left]);
             }
         }
         places
+    }
+
+    /// Where the mover in a column meets the floor: metres ahead and to the left of the camera.
+    fn nearest(&self, rays: &[[f32; 3]], logits: &[f32], column: usize) -> Option<[f32; 2]> {
+        let pixel = |row: usize| row * self.size.width + column;
+        let is_mover = |row: usize| probability(logits[pixel(row)]) >= MOVER_PROBABILITY;
+        let mut rows = (LEAST_PIXELS - 1..self.size.height).rev();
+        let row = rows.find(|&row| (row + 1 - LEAST_PIXELS..=row).all(is_mover))?;
+        // Where the mover ends and the floor begins.
+        let below = rays[pixel((row + 1).min(self.size.height - 1))];
+        let [ahead, left, up] = std::array::from_fn(|axis| 0.5 * (rays[pixel(row)][axis] + below[axis]));
+        (up < 0.0).then(|| [ahead, left].map(|part| part * self.height_m / -up))
     }
 
     /// Whether the pixel or one beside it belongs to a mover: depths at its edge are between those of both sides.

@@ -14,6 +14,8 @@ const INK: u8 = 0;
 const FAINT: u8 = 150;
 const GRID: u8 = 225;
 const OBSTACLE: u8 = 90;
+const MOVER_FIRST: u8 = 225;
+const MOVER_LAST: u8 = 130;
 /// How thick the best way is drawn, in pixels.
 const THICK_PX: f32 = 2.5;
 
@@ -24,14 +26,16 @@ pub struct PlanFan {
     pub ways_m: Vec<Vec<[f32; 2]>>,
     /// What stands in the way.
     pub obstacles_m: Vec<[f32; 2]>,
+    /// Where movers are now, then after each step.
+    pub movers_m: Vec<Vec<[f32; 2]>>,
     /// Where the robot should get.
     pub goal_m: Option<[f32; 2]>,
     /// Radius of the robot.
     pub radius_m: f32,
 }
 
-/// The ways from above: ahead is up. The best way is black, the others are gray; squares are what stands in the way, a cross
-/// is the goal, circles are the robot now and at the end of the best way. The grid's lines are half a metre apart.
+/// The ways from above: ahead is up. The best way is black, the others are gray; squares are what stands in the way, lighter ones
+/// movers, the darker the later; a cross is the goal, circles are the robot now and at the end of the best way. The grid's lines are half a metre apart.
 /// Errors: those of a frame.
 pub fn fan_picture(fan: &PlanFan) -> Result<Frame, FrameError> {
     let places = fan.ways_m.iter().flatten().chain(&fan.goal_m);
@@ -43,6 +47,13 @@ pub fn fan_picture(fan: &PlanFan) -> Result<Frame, FrameError> {
         canvas: Canvas::new(SIDE_PX, SIDE_PX, PAPER),
     };
     view.grid();
+    for (step, places) in fan.movers_m.iter().enumerate() {
+        let share = (step + 1) as f32 / fan.movers_m.len() as f32;
+        let ink = MOVER_FIRST - (share * f32::from(MOVER_FIRST - MOVER_LAST)) as u8;
+        for &place in places {
+            view.dot(place, 0.025 * view.px_per_m, ink);
+        }
+    }
     for &place in &fan.obstacles_m {
         view.dot(place, 0.025 * view.px_per_m, OBSTACLE);
     }
@@ -131,6 +142,7 @@ mod tests {
         let fan = PlanFan {
             ways_m: vec![vec![[0.3, 0.0], [0.5, 0.0]], vec![[0.3, 0.3]]],
             obstacles_m: vec![[0.5, 0.4]],
+            movers_m: vec![vec![[0.8, 0.3]], vec![[0.8, 0.1]]],
             goal_m: Some([0.6, -0.2]),
             radius_m: 0.1,
         };
@@ -144,6 +156,8 @@ mod tests {
             (pixel([0.25, 0.0]), pixel([0.5, 0.4]), pixel([0.6, -0.2])),
             (INK, OBSTACLE, INK)
         );
+        let movers = [pixel([0.8, 0.3]), pixel([0.8, 0.1])];
+        assert!(movers[1] == MOVER_LAST && movers[0] > MOVER_LAST, "{movers:?}");
         assert_eq!(pixel([0.42, 0.25]), PAPER);
         let far = PlanFan {
             goal_m: Some([900.0, -900.0]),
