@@ -20,17 +20,17 @@ fn config(settings: &[&str]) -> TrainConfig {
     let small = [
         "name=squares",
         "data.validation_windows=4",
-        "sequence.steps=250",
+        "sequence.steps=400",
         "sequence.batch_size=8",
         "sequence.learning_rate=0.004",
-        "sequence.movers_weight=0.1",
+        "sequence.movers_weight=0.5",
         "model.context=3",
         "model.horizon=2",
         "model.conditioning=action",
         "model.flow={ channels = 12, stem_channels = 8, enlarged_channels = 4, fine_channels = 6, frames_read = 3, \
          depth = true, movers = true }",
-        "run.validate_every_steps=250",
-        "run.checkpoint_every_steps=250",
+        "run.validate_every_steps=400",
+        "run.checkpoint_every_steps=400",
         "run.warmup_steps=10",
     ];
     let settings: Vec<String> = small
@@ -89,21 +89,15 @@ fn a_network_learns_where_movers_are_and_will_be() {
     let first = dataset.episodes()[4].frames().start;
     for (step, logits) in logits.chunks_exact((SIDE * SIDE) as usize).enumerate() {
         let mask = dataset.mask(first + 2 + step).unwrap().unwrap();
-        let right = logits
-            .iter()
-            .zip(mask.iter())
-            .filter(|(logit, robot)| (**logit > 0.0) == (**robot != 0));
+        let found = logits.iter().zip(mask.iter()).filter(|(logit, _)| **logit > 0.0);
+        let right = found.clone().filter(|(_, robot)| **robot != 0).count();
         // The square has 16 of the 256 pixels.
-        assert!(right.count() >= 252, "step {step}");
+        assert!(right >= 12 && found.count() <= 20, "step {step}: {right}");
     }
 
     // From a model without movers, only what finds them starts anew.
     let plain = dir.path().join("plain");
-    let settings = [
-        "sequence.steps=4",
-        "model.flow={ channels = 12, stem_channels = 8, enlarged_channels = 4, fine_channels = 6, frames_read = 3, \
-         depth = true }",
-    ];
+    let settings = ["sequence.steps=4", "model.flow={ movers = false }"];
     train(&config(&settings), &dataset, &plain, None).unwrap();
     assert!(predicted(&plain, &dataset, 4).movers.is_none());
     let weights = registry::load_weights(&plain.join("model")).unwrap();
@@ -153,7 +147,7 @@ fn movers_cannot_be_learned_without_masks_weight_or_depth() {
         .unwrap_err()
         .to_string();
     assert!(error.contains("sequence.movers_weight is 0"), "{error}");
-    let flat = config(&["model.flow={ movers = true }"]);
+    let flat = config(&["model.flow={ depth = false, movers = true }"]);
     let error = train(&flat, &masked, &dir.path().join("c"), None)
         .unwrap_err()
         .to_string();

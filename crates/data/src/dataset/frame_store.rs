@@ -35,12 +35,12 @@ pub(super) enum FrameStore {
     Memory(Vec<Box<[u8]>>),
     File(Arc<FrameFile>),
     /// Those of joined data sets.
-    Joined(Vec<JoinedImages>),
+    Joined(Vec<JoinedStore>),
 }
 
 /// The images of one of several joined data sets.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) struct JoinedImages {
+pub(super) struct JoinedStore {
     /// Its first frame among those of all.
     pub(super) first_frame: usize,
     pub(super) frame_count: usize,

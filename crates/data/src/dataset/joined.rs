@@ -2,7 +2,7 @@
 
 use sha2::{Digest, Sha256};
 
-use super::frame_store::{FrameContent, FrameStore, JoinedImages};
+use super::frame_store::{FrameContent, FrameStore, JoinedStore};
 use super::{Dataset, DatasetError, DatasetInfo, DatasetPart, Episode};
 use foreframe_core::error_text::comma_separated;
 use foreframe_core::types::Channel;
@@ -43,7 +43,7 @@ impl Dataset {
                 first_frame: first_frame + episode.first_frame,
                 ..episode
             }));
-            stores.push(JoinedImages {
+            stores.push(JoinedStore {
                 first_frame,
                 frame_count: dataset.info.frame_count,
                 images: dataset.images,
