@@ -26,7 +26,7 @@ mod bag_files;
 
 type Reader = fn(&[u8]);
 
-const READERS: [(&str, Reader); 9] = [
+const READERS: [(&str, Reader); 11] = [
     ("messages-json", messages_json),
     ("messages-msgpack", messages_msgpack),
     ("images", images),
@@ -35,6 +35,8 @@ const READERS: [(&str, Reader); 9] = [
     ("shards", shards),
     ("bags", |bytes| imported("bag.mcap", bytes)),
     ("databases", |bytes| imported("bag.db3", bytes)),
+    ("zips", |bytes| imported("walk.zip", bytes)),
+    ("tars", |bytes| imported("walk.tar", bytes)),
     ("videos", |bytes| imported("walk.mp4", bytes)),
 ];
 

@@ -84,7 +84,7 @@ impl<'a> Topics<'a> {
             } = channel;
             return Err(BridgeError::Topic(format!(
                 "the topic {topic} has messages of the type {schema_name:?} in {encoding:?}, which cannot be used for it; images are \
-                 sensor_msgs/msg/Image or CompressedImage in cdr, or foxglove.RawImage or CompressedImage in protobuf; commands and \
+                 sensor_msgs/msg/Image or CompressedImage in cdr, or foxglove.RawImage or CompressedImage in protobuf or json; commands and \
                  states are geometry_msgs/msg/Twist or TwistStamped, nav_msgs/msg/Odometry or sensor_msgs/msg/JointState in cdr"
             )));
         }

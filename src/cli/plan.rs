@@ -9,10 +9,9 @@ use self::answer::{json, print_choice};
 use super::error::CliError;
 use super::output::OutputDirectory;
 use super::process::print_line;
-use super::recorded::{ActionsFile, ImagePaths};
+use super::recorded::{ActionsFile, ImagePaths, SeenFrames};
 use super::settings::CommonArgs;
 use super::workspace::Workspace;
-use foreframe_core::frame::resize::Resize;
 use foreframe_core::frame::{Frame, codec};
 use foreframe_core::planning::{
     Goal, PlanChoice, PlanContext, PlanError, PlanSettings, PlannerInput, SolverKind, SolverSettings, plan,
@@ -37,12 +36,8 @@ pub(super) struct PlanArgs {
     /// The directory of a model, its name, or NAME@VERSION
     #[arg(long)]
     model: String,
-    /// A directory of PNG or JPEG images; color images are converted to gray
-    #[arg(long, value_name = "DIR")]
-    frames: PathBuf,
-    /// The number of the last frame that the model sees, counted from 0 [default: the last frame]
-    #[arg(long, value_name = "N")]
-    at: Option<usize>,
+    #[command(flatten)]
+    seen: SeenFrames,
     /// The robot's states and actions, as for `foreframe predict`; the actions from that frame on are the present plan
     #[arg(long, value_name = "FILE")]
     actions: Option<PathBuf>,
@@ -82,9 +77,6 @@ pub(super) struct PlanArgs {
     /// The distance that the robot should keep, in metres
     #[arg(long, value_name = "M", default_value_t = 0.15)]
     margin: f32,
-    /// What to do with images of another size than the model's: crop, letterbox or stretch [default: refuse them]
-    #[arg(long, value_name = "FIT")]
-    resize: Option<Resize>,
     /// Print the answer as JSON
     #[arg(long)]
     json: bool,
@@ -134,8 +126,8 @@ fn asked(args: &PlanArgs, model: &Model) -> Result<Asked, CliError> {
         let model = manifest.name.clone();
         return Err(PlanError::NoActions { model }.into());
     }
-    let mut images = ImagePaths::list(&args.frames, args.resize)?;
-    let last = images.last_of_context(args.at, &manifest.name, spec)?;
+    let mut images = ImagePaths::list(&args.seen)?;
+    let last = images.last_of_context(&manifest.name, spec)?;
     let seen = images.read(last + 1 - spec.context..last + 1, &manifest.name, spec)?;
     let goal_image = args
         .goal_image

@@ -8,11 +8,10 @@ use self::trust::print_trust;
 use super::error::CliError;
 use super::output::OutputDirectory;
 use super::process::print_line;
-use super::recorded::{ActionsFile, ImagePaths};
+use super::recorded::{ActionsFile, ImagePaths, SeenFrames};
 use super::settings::CommonArgs;
 use super::workspace::Workspace;
 use foreframe_core::error_text;
-use foreframe_core::frame::resize::Resize;
 use foreframe_core::frame::{Frame, FrameError, codec};
 use foreframe_core::nn::ModelSpec;
 use foreframe_core::serving::{self, PredictionInput};
@@ -43,21 +42,14 @@ pub(super) struct PredictArgs {
     /// The directory of a model, its name, or NAME@VERSION
     #[arg(long)]
     model: String,
-    /// A directory of PNG or JPEG images; color images are converted to gray
-    #[arg(long, value_name = "DIR")]
-    frames: PathBuf,
-    /// The number of the last frame that the model sees, counted from 0 [default: the last frame]
-    #[arg(long, value_name = "N")]
-    at: Option<usize>,
+    #[command(flatten)]
+    seen: SeenFrames,
     /// The robot's states and actions; needed by models that take them
     #[arg(long, value_name = "FILE")]
     actions: Option<PathBuf>,
     /// How many frames to predict; more than the model's horizon are beyond what it was trained for [default: the horizon]
     #[arg(long, value_name = "N")]
     steps: Option<usize>,
-    /// What to do with images of another size than the model's: crop, letterbox or stretch [default: refuse them]
-    #[arg(long, value_name = "FIT")]
-    resize: Option<Resize>,
     /// A new directory for the files
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
@@ -109,9 +101,9 @@ pub(super) fn run(args: &PredictArgs) -> Result<(), CliError> {
 /// Reads the frames up to the last that the model sees, and the true frames after it. `spec` has the frames to predict as its
 /// horizon.
 fn select(args: &PredictArgs, name: &ModelName, spec: &ModelSpec) -> Result<Selected, CliError> {
-    let mut images = ImagePaths::list(&args.frames, args.resize)?;
+    let mut images = ImagePaths::list(&args.seen)?;
     let count = images.count();
-    let last = images.last_of_context(args.at, name, spec)?;
+    let last = images.last_of_context(name, spec)?;
     let end = count.min(last + 1 + spec.horizon);
     Ok(Selected {
         last,

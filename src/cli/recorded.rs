@@ -4,4 +4,4 @@ mod actions;
 mod images;
 
 pub(super) use actions::ActionsFile;
-pub(super) use images::ImagePaths;
+pub(super) use images::{ImagePaths, SeenFrames};

@@ -333,6 +333,9 @@ fn report_and_figures_are_written_and_read_back() {
         );
     }
     assert!(!page.contains("src=\"prediction"), "every figure is in the page");
+    let count = |text: &str| page.matches(text).count();
+    assert_eq!((count("<details open>"), count("<details")), (1, count("<h2>")));
+    assert_eq!(count("</details>"), count("<h2>"), "each section can be folded");
     let read: EvaluationReport = serde_json::from_slice(&std::fs::read(out.join("report.json")).unwrap()).unwrap();
     assert_eq!(
         read.to_markdown(),

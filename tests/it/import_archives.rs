@@ -257,6 +257,22 @@ fn the_unpacked_size_and_the_number_of_files_are_bounded() {
 }
 
 #[test]
+fn an_error_names_the_path_in_the_archive() {
+    let csv = b"timestamp,file\n0,0.png\n0.2,1.png\n";
+    for (name, bytes) in [
+        ("drive.zip", zip(&[("walk/log.csv", csv), ("walk/0.png", b"no image")])),
+        (
+            "drive.tar",
+            tar(&[file("walk/log.csv", csv), file("walk/0.png", b"no image")]),
+        ),
+    ] {
+        let error = imported(name, &bytes, 1, 20).unwrap_err().to_string();
+        assert!(error.contains(&format!("{name}/walk/")), "{error}");
+        assert!(!error.contains(".unpacked"), "{error}");
+    }
+}
+
+#[test]
 fn damaged_archives_are_refused() {
     let whole = tar(&[file("1.png", &[7; 3000])]);
     let mut wrong_sum = whole.clone();

@@ -183,6 +183,34 @@ async fn a_collected_data_set_trains_a_served_model() {
 }
 
 #[tokio::test]
+async fn an_evaluation_that_cannot_fit_is_refused_at_once() {
+    let dir = tempfile::tempdir().unwrap();
+    let config = ServerConfig {
+        data_dir: dir.path().to_owned(),
+        ..ServerConfig::default()
+    };
+    let app = App::open(config).await.unwrap();
+    let seen = json!({"kind": "collect", "name": "seen", "scenario": "static-observer", "trials": 2});
+    run_job(&app, &seen).await;
+    let evaluate = |model: &str, fields: Value| {
+        let mut body = json!({"kind": "evaluate", "model": model, "dataset": "seen"});
+        body.as_object_mut()
+            .unwrap()
+            .extend(fields.as_object().unwrap().clone());
+        body
+    };
+    let detail = post(&app, JOBS, &evaluate("donkeycar", json!({}))).await.detail(422);
+    let expected = "dataset: data set \"seen\" has ";
+    assert!(
+        detail.starts_with(expected) && detail.contains("model \"donkeycar\" "),
+        "{detail}"
+    );
+    let twin = post(&app, JOBS, &evaluate("static", json!({"twin": "donkeycar"}))).await;
+    assert!(twin.detail(422).starts_with(expected));
+    assert_eq!(post(&app, JOBS, &evaluate("static", json!({}))).await.status, 202);
+}
+
+#[tokio::test]
 async fn a_cancelled_evaluation_leaves_no_report() {
     let dir = tempfile::tempdir().unwrap();
     // The shipped models take frames of the collected size.

@@ -204,21 +204,42 @@ async fn requests_describe_an_environment_and_begin_one_each() {
     {
         assert_ne!(get(&app, &path(&listed[1..])).await.status, 404, "{listed}");
     }
-    let call = |body: Value| {
-        let (app, path) = (app.clone(), path("mcp"));
-        async move { post(&app, &path, &body).await.json() }
-    };
-    assert_eq!(
-        call(json!({"id": 1, "method": "tools/list"})).await["result"],
-        json!({"tools": []})
-    );
-    assert_eq!(
-        call(json!({"id": 1, "method": "tools/call"})).await["error"]["code"],
-        -32601
-    );
-    assert_eq!(call(json!({})).await["error"]["code"], -32600);
     assert_eq!(get(&app, &path("ws")).await.status, 426);
     get(&app, "/openenv/moon/state").await.detail(404);
+}
+
+#[tokio::test]
+async fn tools_are_listed_by_the_rules_of_json_rpc() {
+    let dir = tempfile::tempdir().unwrap();
+    let app = app(dir.path(), ServerConfig::default());
+    let call = async |body: &str| {
+        let request = Request::post(format!("{ENVIRONMENT}/mcp")).header("content-type", "application/json");
+        send(&app, request.body(Body::from(body.to_owned())).unwrap()).await
+    };
+    let list = call(r#"{"jsonrpc": "2.0", "id": null, "method": "tools/list"}"#)
+        .await
+        .json();
+    assert_eq!(list, json!({"jsonrpc": "2.0", "id": null, "result": {"tools": []}}));
+    for (body, id, code) in [
+        (
+            r#"{"jsonrpc": "2.0", "id": 1, "method": "tools/call"}"#,
+            json!(1),
+            -32601,
+        ),
+        (r#"{"jsonrpc": "2.0", "id": "#, json!(null), -32700),
+        (r#"{"id": 1, "method": "tools/list"}"#, json!(null), -32600),
+        (
+            r#"{"jsonrpc": "2.0", "id": [1], "method": "tools/list"}"#,
+            json!(null),
+            -32600,
+        ),
+        ("[]", json!(null), -32600),
+    ] {
+        let answer = call(body).await.json();
+        assert_eq!((&answer["id"], &answer["error"]["code"]), (&id, &json!(code)), "{body}");
+    }
+    let notification = call(r#"{"jsonrpc": "2.0", "method": "notifications/initialized"}"#).await;
+    assert_eq!((notification.status.as_u16(), notification.body.len()), (202, 0));
 }
 
 #[tokio::test]

@@ -110,6 +110,23 @@ async fn a_source_without_its_upload_is_refused() {
 }
 
 #[tokio::test]
+async fn an_import_whose_upload_is_gone_is_not_resumed() {
+    let dir = tempfile::tempdir().unwrap();
+    let app = app(dir.path(), ServerConfig::default());
+    let received = upload(&app, "walk.zip", vec![7; 99]).await.json();
+    let job = json!({"kind": "import", "name": "walk", "source": received["source"]});
+    let failed = ended(&app, &post(&app, "/v1/jobs", &job).await).await;
+    assert_eq!(failed["state"], "failed", "{failed}");
+    let resume = format!("/v1/jobs/{}/resume", failed["id"].as_str().unwrap());
+    fs::remove_dir_all(dir.path().join("uploads")).unwrap();
+    let detail = post(&app, &resume, &Value::Null).await.detail(422);
+    assert!(
+        detail.starts_with("source: there is no \"upload:") && detail.ends_with("send the file again"),
+        "{detail}"
+    );
+}
+
+#[tokio::test]
 async fn uploads_are_bounded_in_size_and_number() {
     let dir = tempfile::tempdir().unwrap();
     let config = ServerConfig {

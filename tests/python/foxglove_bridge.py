@@ -3,6 +3,7 @@
     foxglove_bridge.py PROGRAM MODELS FRAMES
 """
 
+import base64
 import io
 import json
 import pathlib
@@ -68,14 +69,27 @@ def picture(message):
     return numpy.asarray(Image.open(io.BytesIO(message[message.index(b"\x89PNG") :]))) / 255
 
 
-def drive(program, models, frames, compressed):
+def json_image(path, compressed):
+    """A message of the schemas CompressedImage and RawImage in JSON."""
+    pixels = numpy.asarray(Image.open(path).convert("L"))
+    height, width = pixels.shape
+    own = {"format": "png"} if compressed else {"width": width, "height": height, "encoding": "mono8", "step": width}
+    data = base64.b64encode(path.read_bytes() if compressed else pixels.tobytes()).decode()
+    return json.dumps({"timestamp": {"sec": 0, "nsec": 0}, "frame_id": "camera", "data": data, **own}).encode()
+
+
+def drive(program, models, frames, compressed, as_json):
     """Plays the recorded frames as a robot, and compares what the bridge says of them."""
     listener = Listener()
     context = foxglove.Context()
     server = foxglove.start_server(
         name="test robot", port=0, capabilities=[Capability.ClientPublish], supported_encodings=["cdr"], server_listener=listener, context=context
     )
-    camera = (CompressedImageChannel if compressed else RawImageChannel)("/camera", context=context)
+    if as_json:
+        schema = Schema(name="foxglove." + ("CompressedImage" if compressed else "RawImage"), encoding="jsonschema", data=b"{}")
+        camera = Channel("/camera", schema=schema, message_encoding="json", context=context)
+    else:
+        camera = (CompressedImageChannel if compressed else RawImageChannel)("/camera", context=context)
     # Only the names count for the bridge.
     ros = lambda name: Schema(name=name, encoding="ros2msg", data=b"")
     command = Channel("/cmd_vel", schema=ros("geometry_msgs/msg/Twist"), message_encoding="cdr", context=context)
@@ -98,7 +112,7 @@ def drive(program, models, frames, compressed):
         command.log(twist(*recorded["actions"][index]), log_time=now_ns)
         odom.log(odometry(*recorded["states"][index]), log_time=now_ns)
         image = CompressedImage(data=path.read_bytes(), format="png") if compressed else RawImage(width=width, height=height, encoding="mono8", step=width, data=seen[-1].tobytes())
-        camera.log(image, log_time=now_ns)
+        camera.log(json_image(path, compressed) if as_json else image, log_time=now_ns)
         predictions = max(0, index + 1 - HORIZON + 1)
         listener.wait(lambda: len(listener.of("/foreframe/predicted")) >= predictions, f"prediction {predictions}")
     predicted = [picture(message) for message in listener.of("/foreframe/predicted")]
@@ -111,11 +125,12 @@ def drive(program, models, frames, compressed):
         assert abs(error - own) < 1e-6, (error, own)
     listener.wait(lambda: len(listener.of("/foreframe/expected_error")) == len(predicted), "the last expected error")
     mean, still = numpy.mean(errors), numpy.mean([numpy.mean((old / 255.0 - new / 255.0) ** 2) for old, new in zip(seen[HORIZON - 1 :], truth)])
-    print(f"{'compressed' if compressed else 'raw'} images: {len(predicted)} predictions, mean error {mean:.4f}; that of the last frame {still:.4f}")
+    print(f"{'compressed' if compressed else 'raw'} images in {'JSON' if as_json else 'Protocol Buffers'}: {len(predicted)} predictions, mean error {mean:.4f}; that of the last frame {still:.4f}")
     assert mean < still
     server.stop()
     assert bridge.wait(timeout=30) == 1, bridge.stderr.read()
 
 
-for compressed in (True, False):
-    drive(sys.argv[1], sys.argv[2], pathlib.Path(sys.argv[3]), compressed)
+for as_json in (False, True):
+    for compressed in (True, False):
+        drive(sys.argv[1], sys.argv[2], pathlib.Path(sys.argv[3]), compressed, as_json)

@@ -245,6 +245,22 @@ impl Versions {
         Ok(loaded)
     }
 
+    /// Describes a version, by default the one that [`Self::load_active`] would load. Errors: `Unknown`, `Refused`, `Store`.
+    pub async fn manifest(&self, model: &ModelName, version: Option<u32>) -> Result<Manifest, VersionError> {
+        let version = match version {
+            Some(version) => version,
+            None => self.active(model).await?.unwrap_or_default(),
+        };
+        let dir = self.directory(model, version).await?;
+        let refused = |reason| VersionError::refused(model, version, reason);
+        let read = tokio::task::spawn_blocking(move || registry::manifest::read(&dir)).await;
+        let manifest = read.map_err(|error| refused(error.to_string()))?;
+        let mut manifest = manifest.map_err(|error| refused(error_text::with_causes(&error)))?;
+        // The name of a shipped model is that of its directory.
+        manifest.name.clone_from(model);
+        Ok(manifest)
+    }
+
     /// The directory of a version, fetched into the data directory if it is not there. Errors: `Unknown`, `Store`.
     pub async fn directory(&self, model: &ModelName, version: u32) -> Result<PathBuf, VersionError> {
         let available = self.of(model).await?;

@@ -36,6 +36,7 @@ mod windows;
 use std::time::Instant;
 
 pub use self::calibrate::{calibrate, calibrate_trained};
+pub use self::compatible::check_fit;
 pub use self::config::{EvaluateConfig, NEAREST_WINDOWS, ScoredSplit};
 pub use self::error::EvaluationError;
 pub use self::figures::draw_figures;

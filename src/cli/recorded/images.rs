@@ -16,18 +16,35 @@ use foreframe_core::types::ModelName;
 /// The endings of the files that are read.
 const ENDINGS: [&str; 3] = ["png", "jpg", "jpeg"];
 
+/// Which images a model sees.
+#[derive(clap::Args)]
+pub(in crate::cli) struct SeenFrames {
+    /// A directory of PNG or JPEG images; color images are converted to gray
+    #[arg(long, value_name = "DIR")]
+    frames: PathBuf,
+    /// The number of the last frame that the model sees, counted from 0 [default: the last frame]
+    #[arg(long, value_name = "N")]
+    at: Option<usize>,
+    /// What to do with images of another size than the model's: crop, letterbox or stretch [default: refuse them]
+    #[arg(long, value_name = "FIT")]
+    resize: Option<Resize>,
+}
+
 /// The image files of a directory.
 pub(in crate::cli) struct ImagePaths {
     dir: PathBuf,
     paths: Vec<PathBuf>,
+    /// The number of the last frame that the model sees.
+    at: Option<usize>,
     resize: Option<Resize>,
     /// Whether it was said that color images are converted.
     has_reported_color: bool,
 }
 
 impl ImagePaths {
-    /// Lists the images of a directory; `resize` says what to do with images of another size than the model's.
-    pub(in crate::cli) fn list(dir: &Path, resize: Option<Resize>) -> Result<Self, CliError> {
+    /// Lists the images of a directory.
+    pub(in crate::cli) fn list(seen: &SeenFrames) -> Result<Self, CliError> {
+        let dir = seen.frames.as_path();
         let unreadable = |error| CliError::io("read", dir, &error);
         let mut paths = std::fs::read_dir(dir)
             .map_err(unreadable)?
@@ -42,7 +59,8 @@ impl ImagePaths {
         Ok(Self {
             dir: dir.to_owned(),
             paths,
-            resize,
+            at: seen.at,
+            resize: seen.resize,
             has_reported_color: false,
         })
     }
@@ -51,13 +69,8 @@ impl ImagePaths {
         self.paths.len()
     }
 
-    /// The number of the last frame that the model sees: `at`, or the last image. Errors: `Usage` if there are not enough before it.
-    pub(in crate::cli) fn last_of_context(
-        &self,
-        at: Option<usize>,
-        model: &ModelName,
-        spec: &ModelSpec,
-    ) -> Result<usize, CliError> {
+    /// The number of the last frame that the model sees. Errors: `Usage` if there are not enough before it.
+    pub(in crate::cli) fn last_of_context(&self, model: &ModelName, spec: &ModelSpec) -> Result<usize, CliError> {
         let (count, dir) = (self.count(), self.dir.display());
         if count < spec.context {
             return Err(CliError::Usage(format!(
@@ -65,7 +78,7 @@ impl ImagePaths {
                 spec.context
             )));
         }
-        let last = at.unwrap_or(count - 1);
+        let last = self.at.unwrap_or(count - 1);
         if (spec.context - 1..count).contains(&last) {
             return Ok(last);
         }

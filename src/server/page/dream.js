@@ -128,7 +128,7 @@ export function Dream({ robot }) {
         <p class="quiet">${whatItGets(robot.model, dream)}</p>
       </div>
     </div>
-    <${Drift} dream=${dream} period_s=${robot.spec.frame_period_s} />
+    ${dream ? html`<${Drift} dream=${dream} period_s=${robot.spec.frame_period_s} />` : html`<${Before} robot=${robot} note=${note} />`}
     <footer><${Copy} curl=${() => curl("POST", `/v1/models/${robot.model.name}/predict`, body(robot))} python=${() => requests("POST", `/v1/models/${robot.model.name}/predict`, body(robot))} /></footer>
   </section>`;
 }
@@ -136,6 +136,17 @@ export function Dream({ robot }) {
 function whatItGets(model, dream) {
   if (!takesActions(model)) return dream ? "The model gets no camera frame." : "Cut the camera: the model goes on from its own frames.";
   return dream ? "The model gets no camera frame, only your keys." : "Cut the camera: the model goes on from its own frames, under your keys.";
+}
+
+// What a dream is, and how one would begin.
+function Before({ robot, note }) {
+  const { spec, history } = robot;
+  const frames = history.findLast(({ prediction }) => prediction)?.prediction.frames ?? [];
+  const ahead_s = step => ((step + 1) * spec.frame_period_s).toFixed(1);
+  return html`<h2>The next ${ahead_s(spec.horizon - 1)} s, as a dream would begin now</h2>
+    <div class="strip" style=${{ "--count": spec.horizon }}>${Array.from({ length: spec.horizon }, (_, step) => html`
+      <${Picture} image=${frames[step]} caption=${`+${ahead_s(step)} s`} label=${`imagined for +${ahead_s(step)} s`} note=${frames.length ? "" : note} />`)}</div>
+    <p class="quiet">A model predicts ${spec.horizon} frames. In a dream it takes its own first frame for the camera's, predicts again, and so on, for as long as you like: its mistakes add up. The picture on the right shows what really happens meanwhile, and a line how far both are apart.</p>`;
 }
 
 const DRIFT_LINES = [{ label: "error", color: "--orange", width: 2 }];

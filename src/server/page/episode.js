@@ -2,9 +2,10 @@
 
 import { html, useEffect, useMemo, useRef, useState } from "./preact.js";
 import { go, note } from "./address.js";
+import { cameraOf } from "./camera.js";
 import { Picture } from "./picture.js";
 import { COLORS, Plot } from "./plot.js";
-import { compare, levels, lookBack } from "./score.js";
+import { bestGuess, compare, GUESSES, guessError, levels, lookBack } from "./score.js";
 import { Copy, curl, requests } from "./snippets.js";
 import { fits, readEpisode } from "./sources.js";
 import { Stream } from "./stream.js";
@@ -60,7 +61,7 @@ async function predictAll(model, { frames, actions, states }, tell, isGone) {
       answers = [...answers, await stream.send({ ...moment, plan: plan.length === spec.horizon ? plan : undefined })].slice(-spec.horizon - 1);
       history.push(moment);
       const past = lookBack(history, spec);
-      if (past && answers[0].type === "prediction") Object.assign(moment, compare(frame, past.context, answers[0]));
+      if (past && answers[0].type === "prediction") Object.assign(moment, compare(moment, past, answers[0], spec, cameraOf(model)));
       if (place % TOLD_EVERY === 0) tell([...history]);
     }
     tell([...history]);
@@ -148,12 +149,13 @@ function Choice({ models, model, other, dataset, number }) {
 
 function ErrorLane({ moments, models, player }) {
   const count = Math.max(...moments.map(one => one.length));
+  const best = useMemo(() => bestGuess(moments[0]), [moments[0]]);
   const data = useMemo(() => {
     const lines = moments.filter((_, place) => models[place]).map(one => Array.from({ length: count }, (_, at) => (one[at]?.error === undefined ? null : levels(one[at].error))));
-    const guess = Array.from({ length: count }, (_, at) => (moments[0][at]?.guess_error === undefined ? null : levels(moments[0][at].guess_error)));
+    const guess = Array.from({ length: count }, (_, at) => (moments[0][at]?.guess_errors ? levels(guessError(moments[0][at], best)) : null));
     return [Array.from({ length: count }, (_, at) => at), guess, ...lines];
   }, [count, ...moments]);
-  const series = [{ label: "simple guess", color: "--quiet", dash: [4, 4], width: 1 }, ...models.filter(Boolean).map(({ name }, place) => ({ label: name, color: ["--orange", "--violet"][place], width: 2 }))];
+  const series = [{ label: `best simple guess: ${GUESSES[best]}`, color: "--quiet", dash: [4, 4], width: 1 }, ...models.filter(Boolean).map(({ name }, place) => ({ label: name, color: ["--orange", "--violet"][place], width: 2 }))];
   const worst = data[2].reduce((found, value, at) => (value > (data[2][found] ?? -1) ? at : found), 0);
   return html`<h2>Error of the prediction <button class="small" disabled=${data[2][worst] == null} onClick=${() => player.jump(worst)}>jump to the worst</button></h2>
     <${Plot} label="error of the prediction for each frame" data=${data} series=${series} height=${130} y="gray levels" sync="episode" mark=${player.at} onPick=${player.jump} legend />`;

@@ -139,7 +139,20 @@ function Markdown({ path, picture }) {
   useEffect(() => {
     text(path).then(words => setBlocks(words.split(/\n{2,}/)), error => setBlocks([error.message]));
   }, [path]);
-  return html`<div class="report">${blocks.map(block => html`<${Block} text=${block.trim()} picture=${picture} />`)}</div>`;
+  const [summary, ...sections] = sectionsOf(blocks);
+  const drawn = some => some.map(block => html`<${Block} text=${block.trim()} picture=${picture} />`);
+  return html`<div class="report">${drawn(summary)}${sections.map(([heading, ...rest], place) => html`
+    <details open=${place === 0}><summary><${Block} text=${heading.trim()} picture=${picture} /></summary>${drawn(rest)}</details>`)}</div>`;
+}
+
+// The blocks before the first heading of the second level, and those of each such heading.
+function sectionsOf(blocks) {
+  const sections = [[]];
+  for (const block of blocks) {
+    if (block.trim().startsWith("## ")) sections.push([]);
+    sections.at(-1).push(block);
+  }
+  return sections;
 }
 
 function Block({ text: words, picture }) {

@@ -47,7 +47,7 @@ function Card({ model, act, is_marked, mark }) {
   </article>`;
 }
 
-// 0 is as good as the strongest simple guess, 1 is perfect.
+// 0 is as good as the strongest baseline, 1 is perfect.
 function Skill({ skill, interval, baseline }) {
   if (skill === undefined) return html`<p class="quiet">skill not measured; evaluate it on a data set</p>`;
   const place = value => Math.max(0, Math.min(100, 100 * value));

@@ -25,7 +25,9 @@ export function Play({ robot }) {
   const ahead_s = (spec.horizon * spec.frame_period_s).toFixed(1);
   const note = noteOf(robot, now);
   const is_old = compared !== now;
-  const score = share(history);
+  // Words and numbers once a second: faster ones cannot be read, and cost more than the pictures.
+  const verdict = useMemo(() => html`<${Verdict} robot=${robot} score=${share(history)} />`, [robot.second, robot.status]);
+  const driving = useMemo(() => html`<${Driving} robot=${robot} />`, [robot.second, robot.status, isManual()]);
   return html`<section class="play">
     <h1 class="visually-hidden">Play</h1>
     <div class="three">
@@ -45,7 +47,7 @@ export function Play({ robot }) {
         ${SPEEDS.map(speed => html`<option value=${speed}>${speed}×, ${Math.round(speed / spec.frame_period_s)} frames/s</option>`)}</select></label>
       <span class="key"><i class="brighter" /> camera brighter <i class="darker" /> camera darker</span>
     </div>
-    <${Verdict} robot=${robot} score=${score} />
+    ${verdict}
     <h2>From now to +${ahead_s} s${takesActions(robot.model) ? ", if the action stays" : ""}</h2>
     <div class=${`strip ${robot.status === "running" ? "" : "dim"}`} style=${{ "--count": spec.horizon }}>
       ${Array.from({ length: spec.horizon }, (_, step) => html`<button class="enlarge" aria-label=${`predicted for +${label(spec, step)} s; enlarges`}>
@@ -53,7 +55,7 @@ export function Play({ robot }) {
     </div>
     <div class="columns">
       <${Errors} history=${history} />
-      <${Driving} robot=${robot} />
+      ${driving}
     </div>
     <footer><${Copy} python=${() => program(robot)}
       curl=${() => curl("GET", `/v1/models/${robot.model.name}/preview.png`, undefined, " -o preview.png")} />
@@ -83,15 +85,16 @@ function Verdict({ robot, score }) {
   const percent = score && !score.is_still ? 100 * score.of_guess : null;
   const words = !score ? "No prediction has come true yet"
     : score.is_still ? `Nothing moves; error ${levels(score.error).toFixed(1)} of 255 gray levels`
-    : `Error ${percent < 1000 ? percent.toFixed(0) : ">999"} % of the best simple guess`;
+    : `Error ${percent < 1000 ? percent.toFixed(0) : ">999"} % of that of ${score.best}`;
   const warnings = robot.history.at(-1)?.prediction?.warnings ?? [];
   return html`<div class=${`verdict ${is_unlike ? "bad" : ""}`}>
-    <p class="line"><b title=${`The better of two guesses that need no model: the last frame of the context, and the mean of the context. Over the last ${AVERAGED} frames.`}>${words}</b>
+    <p class="line"><b>${words}</b>
       ${novel !== null && html`<span>; novelty <b class=${noveltyClass(novel)}>${noveltyWord(novel)}</b></span>`}</p>
-    <div class="bar" role="img" aria-label=${percent === null ? "no error yet" : `error ${percent.toFixed(0)} percent of the best simple guess`}>
+    <div class="bar" role="img" aria-label=${percent === null ? "no error yet" : `error ${percent.toFixed(0)} percent of that of ${score.best}`}>
       <span class=${percent === null ? "" : percent < 100 ? "good" : "bad"} style=${{ width: `${Math.min(100, (percent ?? 0) / 2)}%` }} />
       <i style=${{ left: "50%" }} /></div>
-    <p class="ends"><span>0 %</span><span>as good as the guess</span><span>200 %</span></p>
+    <p class="ends"><span>0 %: perfect</span><span>100 %: no better than ${score?.best ?? "a copy"}</span><span>200 %</span></p>
+    <p class="quiet small-print">Compared, over the last ${AVERAGED} frames, with the best of three guesses without a model: a copy of the last frame that the model saw, that copy turned as the robot has turned since, and the mean of the frames that it saw. A model's skill is measured against stronger ones.</p>
     <p class="warning" role="status">${is_unlike ? "Unlike the training data: do not trust this." : warnings[0] ?? ""}</p>
   </div>`;
 }

@@ -2,8 +2,8 @@
 
 import { useEffect, useState } from "./preact.js";
 import { Locked, pause } from "./api.js";
+import { cameraOf } from "./camera.js";
 import { heldAction, isManual } from "./keys.js";
-import { predictLast } from "./predict.js";
 import { compare, lookBack } from "./score.js";
 import { openSource } from "./sources.js";
 import { sendAll, Stream } from "./stream.js";
@@ -42,16 +42,24 @@ export class Robot {
     return this.source?.is_drivable ?? false;
   }
 
-  // The moments that the model's context holds, of one episode.
+  // Which second the last moment is of; fast robots change it sooner.
+  get second() {
+    return Math.floor((this.history.at(-1)?.at_s ?? 0) * this.speed);
+  }
+
+  // The moments of the present episode, as far as they are kept.
+  get episode_moments() {
+    return this.history.slice(Math.max(0, this.history.findLastIndex(({ begins }) => begins)));
+  }
+
+  // Those that the model's context holds.
   get context() {
-    const begin = this.history.findLastIndex(({ begins }) => begins);
-    return this.history.slice(Math.max(begin, this.history.length - this.spec.context));
+    return this.episode_moments.slice(-this.spec.context);
   }
 
   // Whether the present episode is long enough for a prediction that has come true.
   get is_warm() {
-    const begin = this.history.findLastIndex(({ begins }) => begins);
-    return this.history.length - Math.max(begin, 0) >= this.spec.context + this.spec.horizon;
+    return this.episode_moments.length >= this.spec.context + this.spec.horizon;
   }
 
   hold(is_held) {
@@ -94,9 +102,9 @@ export class Robot {
   }
 
   disconnect() {
-    this.stream?.close();
+    this.closeStreams();
     this.source?.close();
-    this.stream = this.source = null;
+    this.source = null;
   }
 
   async tick() {
@@ -107,7 +115,7 @@ export class Robot {
     const started_ms = performance.now();
     const moment = this.now;
     // A stream has the context of one episode.
-    if (moment.begins || !this.stream || this.stream.socket.readyState !== WebSocket.OPEN) await this.openStream();
+    if (moment.begins || !this.stream || this.stream.socket.readyState !== WebSocket.OPEN) await this.openStreams();
     moment.action = this.nextAction(moment);
     const [answer, next, comparison] = await Promise.all([this.stream.send(moment), this.source.step(moment.action), this.compare(moment), this.beside(moment)]);
     this.receive(Object.assign(moment, comparison), answer);
@@ -118,17 +126,33 @@ export class Robot {
     await pause(Math.max(0, period_ms - (performance.now() - started_ms)));
   }
 
-  // A new stream, with the context so far.
-  async openStream() {
-    this.stream?.close();
-    this.stream = await Stream.open(this.model.name, this.now.camera);
-    if (!this.now.begins) await sendAll(this.stream, this.context.slice(1 - this.spec.context));
+  // A new stream, with the context so far, and one for what was predicted a horizon ago, with the context of then.
+  async openStreams() {
+    this.closeStreams();
+    const { model, now, spec: { horizon, context } } = this;
+    this.stream = await Stream.open(model.name, now.camera);
+    this.late = await Stream.open(model.name, now.camera);
+    if (now.begins) return;
+    await sendAll(this.stream, this.context.slice(1 - context));
+    await sendAll(this.late, this.episode_moments.slice(0, -horizon).slice(1 - context));
   }
 
-  // How the moment compares with what the model predicts for it from the frames up to `horizon` ago and the actions since.
+  closeStreams() {
+    this.stream?.close();
+    this.late?.close();
+    this.stream = this.late = null;
+  }
+
+  // How the moment compares with what the model predicts for it from the frames up to `horizon` ago and the actions since. The late
+  // stream has the frames before: one frame and one message are less work than a request with a whole context.
   async compare(moment) {
-    const past = lookBack([...this.history, moment], this.spec);
-    return past && compare(moment.frame, past.context, await predictLast(this.model, past.context, past.plan));
+    const moments = moment.begins ? [moment] : [...this.episode_moments, moment];
+    const { horizon } = this.spec;
+    if (moments.length <= horizon) return null;
+    const since = moments.slice(-horizon - 1, -1);
+    const answer = await this.late.send({ ...since[0], plan: since.map(({ action }) => action) });
+    const past = lookBack(moments, this.spec);
+    return past && answer.type === "prediction" ? compare(moment, past, answer, this.spec, moment.camera ?? cameraOf(this.model)) : null;
   }
 
   receive(moment, answer) {

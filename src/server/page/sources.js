@@ -1,14 +1,12 @@
 // Where frames come from: the simulator, or a recorded episode. And which sources fit a model.
 
 import { call, deleteAtEnd, get } from "./api.js";
+import { SIMULATOR_CAMERA } from "./camera.js";
 import { fromPng } from "./gray.js";
 import { estimatesDepth, takesActions, takesState } from "./server_lists.js";
 
 const SIMULATOR_ACTIONS = ["linear", "angular"];
 export const SIMULATOR_STATES = ["x", "y", "heading_cos", "heading_sin", "linear", "angular"];
-// The camera of the simulated robot, unless the model names another one.
-const DEFAULT_CAMERA = { height_m: 0.6, horizontal_fov_rad: Math.PI / 3, tilt_down_rad: 0.2, noise_std: 1 / 255 };
-
 // Each episode in a room of its own.
 export const VARIED = "simulator:varied";
 
@@ -53,7 +51,7 @@ class Simulator {
     const stands = scenario === "static-observer";
     const world = { frame_period_s, frame_width_px, frame_height_px, max_duration_s: stands ? 30 : 3600 };
     if (is_varied) world.rooms = "varied";
-    else if (camera) world.camera = { ...DEFAULT_CAMERA, horizontal_fov_rad: camera.horizontal_fov_rad, tilt_down_rad: camera.tilt_down_rad };
+    else if (camera) world.camera = { ...SIMULATOR_CAMERA, horizontal_fov_rad: camera.horizontal_fov_rad, tilt_down_rad: camera.tilt_down_rad };
     const seed = Math.floor(Math.random() * 2 ** 32);
     const made = await call("POST", "/v1/environments", { scenario, seed, world });
     return new Simulator(made, !stands, await moment(made, null));
@@ -83,12 +81,12 @@ class Simulator {
 // `before` is null where an episode begins.
 async function moment({ observation, info }, before) {
   const frame = await fromPng(observation.frame);
-  const camera = before ? before.camera : cameraOf(info.trial?.room);
+  const camera = before ? before.camera : roomCamera(info.trial?.room);
   return { frame, state: observation.state, driver: info.policy_action, poses: info.poses, begins: !before, camera };
 }
 
 // A model has no use for the noise of the room's camera.
-function cameraOf(room) {
+function roomCamera(room) {
   if (!room) return undefined;
   const { height_m, horizontal_fov_rad, tilt_down_rad } = room.camera;
   return { height_m, horizontal_fov_rad, tilt_down_rad };

@@ -122,7 +122,7 @@ function NewEvaluation({ models, datasets, submit }) {
   return models.length > 0 && html`<form class="card" onSubmit=${event => { event.preventDefault(); submit(spec); }}><h2>New evaluation</h2><div class="form">
       <label>Model <select value=${model} onChange=${set("model")}>${models.map(({ name }) => html`<option value=${name}>${name}</option>`)}</select></label>
       <label>Data set <select value=${dataset} onChange=${set("dataset")}>${datasets.map(({ name }) => html`<option value=${name}>${name}</option>`)}</select></label>
-    </div><p class="quiet">Compares the model with simple guesses on trials that training did not use, and writes a report.</p>
+    </div><p class="quiet">Compares the model with baselines on trials that training did not use, and writes a report.</p>
     <div class="actions"><button class="main">Evaluate</button><${Copy} curl=${() => curl("POST", "/v1/jobs", spec)} python=${() => requests("POST", "/v1/jobs", spec)} /></div></form>`;
 }
 

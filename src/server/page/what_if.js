@@ -74,6 +74,7 @@ export function WhatIf({ robot }) {
     return () => clearTimeout(soon);
   }, [follows, plans]);
   const step = useAnimation(robot);
+  const horizon_s = (robot.spec.horizon * robot.spec.frame_period_s).toFixed(1);
   if (!takesActions(robot.model)) {
     return html`<div class="empty"><h1>“${robot.model.name}” takes no actions</h1><p>Without actions there is nothing to choose between. Take a model with actions.</p></div>`;
   }
@@ -81,9 +82,10 @@ export function WhatIf({ robot }) {
   const is_moving = robot.plan.length > 0;
   return html`<section class="what-if">
     <h1 class="visually-hidden">What if</h1>
+    <p>Nine ways to drive for the next ${horizon_s} s, each as the model expects the camera to see it. <b>Best</b> is the one that ends with the view that is most like the goal: that picture you choose.</p>
     <div class="overview">
       <${Picture} image=${frame} caption="the present frame" label="the present frame" note=${frame ? "" : note} dim=${robot.status === "reconnecting"} />
-      <${Picture} image=${goal} caption="the goal" label="the goal" note=${goal ? "" : note} />
+      <${Picture} image=${goal} caption="the goal: what to see in the end" label="the goal" note=${goal ? "" : note} />
       <figure class="picture"><figcaption>from above</figcaption><${Ways} robot=${robot} plans=${plans} best=${best} /></figure>
     </div>
     <div class="toolbar">
@@ -93,11 +95,11 @@ export function WhatIf({ robot }) {
       ${!robot.is_drivable && html`<span class="quiet">A recording cannot take a plan.</span>`}
     </div>
     <p class="wrong" role="alert">${wrong}</p>
-    <h2>What the next ${(robot.spec.horizon * robot.spec.frame_period_s).toFixed(1)} s would look like</h2>
-    <p class="quiet">The cost is the difference between the last predicted frame and the goal, in gray levels, ± the error to expect. The cheapest plan is outlined. Click one, and the robot takes it.</p>
+    <h2>What the next ${horizon_s} s would look like</h2>
+    <p class="quiet">Click one, and the robot takes it. Its cost is the difference between its last predicted frame and the goal, in gray levels, ± the error to expect.</p>
     <div class="plans">${(plans.length ? plans : PLANS.map(([name, , , color]) => ({ name, color, frames: [] }))).map((plan, place) => html`
       <button class=${`plan ${place === best && plans.length ? "best" : ""}`} disabled=${!plans.length || is_moving || !robot.is_drivable} onClick=${() => take(plan)}>
-        <h3><i style=${{ background: `var(${plan.color})` }} />${plan.name}</h3>
+        <h3><i style=${{ background: `var(${plan.color})` }} />${plan.name}${place === best && plans.length ? html` <span class="mark">best</span>` : ""}</h3>
         <${Picture} image=${plan.frames[step] ?? frame} label=${`predicted for ${plan.name}`} note=${plans.length ? "" : note} />
         <p>${plans.length ? html`cost <b>${levels(costs[place]).toFixed(1)}</b>${plan.expected === undefined ? "" : ` ± ${levels(plan.expected).toFixed(1)}`}` : "…"}</p>
       </button>`)}</div>

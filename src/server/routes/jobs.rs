@@ -180,6 +180,7 @@ async fn cancel(app: App, author: Author, Path(id): Path<String>) -> Result<impl
     responses(
         (status = 202, description = "Queued again", body = Job),
         (status = 409, description = "It has not ended, or has succeeded"),
+        (status = 422, description = "The file that it imports was deleted"),
         (status = 503, description = "Too many jobs wait"),
     )
 )]

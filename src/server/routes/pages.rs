@@ -28,11 +28,12 @@ macro_rules! page_files {
     };
 }
 
-const PAGE_FILES: [(&str, &str); 29] = page_files![
+const PAGE_FILES: [(&str, &str); 30] = page_files![
     "address.js",
     "api.js",
     "app.js",
     "base64.js",
+    "camera.js",
     "data.js",
     "dream.js",
     "episode.js",

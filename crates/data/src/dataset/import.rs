@@ -61,7 +61,9 @@ pub fn import(
     let write = || {
         // Its images are read while the data set is written.
         let source = UnpackedSource::of(config, cancelled)?;
-        directory.write(&plan(&source.path, config, cancelled)?, on_progress, cancelled)
+        let written =
+            plan(&source.path, config, cancelled).and_then(|plan| directory.write(&plan, on_progress, cancelled));
+        written.map_err(|error| source.name_in_archive(error))
     };
     let imported = write();
     if imported.is_err() {

@@ -78,6 +78,10 @@ impl JobExecutor for ChildExecutor {
         self.pipeline.check(spec)
     }
 
+    fn check_again<'a>(&'a self, spec: &'a JobSpec) -> BoxFuture<'a, Result<(), JobError>> {
+        self.pipeline.check_again(spec)
+    }
+
     fn execute(&self, spec: &JobSpec, report: &JobReporter, cancelled: &AtomicBool) -> Result<JobResult, JobFailure> {
         let mut child = self.spawn().map_err(|error| crashed("could not start", &error))?;
         let result = self.communicate(&mut child, spec, report, cancelled);

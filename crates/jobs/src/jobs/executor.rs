@@ -48,6 +48,11 @@ pub trait JobExecutor: Send + Sync + 'static {
     /// data sets and models.
     fn check<'a>(&'a self, spec: &'a JobSpec) -> BoxFuture<'a, Result<(), JobError>>;
 
+    /// Checks that what an ended job needs is still there, before it is enqueued again. Errors: `Invalid`, `Store`.
+    fn check_again<'a>(&'a self, _spec: &'a JobSpec) -> BoxFuture<'a, Result<(), JobError>> {
+        Box::pin(std::future::ready(Ok(())))
+    }
+
     /// Does the work, or resumes it. Returns `Cancelled` soon after `cancelled` becomes true. Blocks.
     fn execute(&self, spec: &JobSpec, report: &JobReporter, cancelled: &AtomicBool) -> Result<JobResult, JobFailure>;
 }

@@ -75,6 +75,10 @@ impl JobExecutor for Pipeline {
         Box::pin(self.check_spec(spec))
     }
 
+    fn check_again<'a>(&'a self, spec: &'a JobSpec) -> BoxFuture<'a, Result<(), JobError>> {
+        Box::pin(self.check_upload(spec))
+    }
+
     fn execute(&self, spec: &JobSpec, report: &JobReporter, cancelled: &AtomicBool) -> Result<JobResult, JobFailure> {
         if let Some(after) = spec.after() {
             self.check_earlier(after, &self.retry_policy(report, cancelled))?;
@@ -130,12 +134,47 @@ impl Pipeline {
             })
         });
         checked.await.unwrap_or(Err(JobError::Stopping))?;
-        let JobSpec::Train(spec) = spec else { return Ok(()) };
-        if !is_there {
-            // How much memory it needs is known when its data set is made.
-            return Ok(());
+        match spec {
+            // How much memory it needs, and which models fit, is known when its data set is made.
+            _ if !is_there => Ok(()),
+            JobSpec::Train(spec) => self.resources.memory.check(spec, objects).await,
+            JobSpec::Evaluate(spec) => self.check_evaluation(spec).await,
+            JobSpec::Collect(_) | JobSpec::Import(_) => Ok(()),
         }
-        self.resources.memory.check(spec, objects).await
+    }
+
+    /// Errors: `Invalid` if an import's uploaded file is gone.
+    async fn check_upload(&self, spec: &JobSpec) -> Result<(), JobError> {
+        let JobSpec::Import(spec) = spec else { return Ok(()) };
+        let Some(upload) = spec.upload()? else { return Ok(()) };
+        let objects = self.store.objects();
+        upload.fetch(objects).await?;
+        upload.existing(objects.data_dir()).map(drop)
+    }
+
+    /// Errors: `Invalid` if a model that is there cannot run on the data set.
+    async fn check_evaluation(&self, spec: &EvaluateSpec) -> Result<(), JobError> {
+        let info = DatasetInfo {
+            // The caller knows it by this name.
+            name: spec.dataset.to_string(),
+            ..datasets::describe(self.store.objects(), &spec.dataset).await?
+        };
+        let fits = async |name: &ModelName, version: Option<u32>| {
+            // What cannot be read says so when the job runs.
+            let Ok(manifest) = self.versions.manifest(name, version).await else {
+                return Ok(());
+            };
+            let fit = evaluation::check_fit(&manifest, &info);
+            fit.map_err(|error| JobError::invalid("dataset", error.to_string()))
+        };
+        // Without a version, an earlier job may make the one that is meant.
+        if spec.version.is_some() || spec.after.is_none() {
+            fits(&spec.model, spec.version).await?;
+        }
+        match &spec.twin {
+            Some(twin) if spec.after.is_none() => fits(twin, None).await,
+            _ => Ok(()),
+        }
     }
 
     /// Errors: `Failed` if the job that another waited for did not succeed.

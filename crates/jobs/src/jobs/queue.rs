@@ -158,7 +158,8 @@ impl Jobs {
     }
 
     /// Enqueues a failed or cancelled job again; it continues from its last checkpoint.
-    /// Errors: `Unknown`, `IllegalTransition`, `QueueFull`, `Taken`, `Stopping`, `Store`.
+    /// Errors: `Unknown`, `IllegalTransition`, what [`JobExecutor::check_again`] refuses, `QueueFull`, `Taken`, `Stopping`,
+    /// `Store`.
     pub async fn resume(&self, id: JobId, by: &Author) -> Result<Job, JobError> {
         if self.shared.is_stopping() {
             return Err(JobError::Stopping);
@@ -168,6 +169,7 @@ impl Jobs {
         if job.state.after(JobTransition::Resume).is_none() {
             return Err(illegal(id, job.state, JobTransition::Resume));
         }
+        self.shared.execute.check_again(&job.spec).await?;
         let limit = self.shared.limits.queued as i64;
         match self.shared.store.requeue(row.id, limit, by).await? {
             Some(EnqueueResult::New(row)) => {

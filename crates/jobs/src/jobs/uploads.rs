@@ -105,8 +105,9 @@ impl UploadedFile {
         if path.is_file() {
             return Ok(path);
         }
-        let reason =
-            format!("there is no \"{self}\"; an upload is deleted when its import has ended, or if none begins");
+        let reason = format!(
+            "there is no \"{self}\"; an upload is deleted when its import has succeeded, and after a while; send the file again"
+        );
         Err(JobError::invalid("source", reason))
     }
 }

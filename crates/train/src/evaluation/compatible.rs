@@ -3,21 +3,26 @@
 use super::EvaluationError;
 use foreframe_core::error_text::comma_separated;
 use foreframe_core::nn::ModelSpec;
-use foreframe_core::registry::Model;
+use foreframe_core::registry::{Manifest, Model};
 use foreframe_core::types::Seed;
-use foreframe_data::dataset::Dataset;
+use foreframe_data::dataset::{Dataset, DatasetInfo};
 
 /// Frame periods count as equal if they differ by less than this share.
 const PERIOD_TOLERANCE: f64 = 0.01;
 
 /// Errors: `Mismatch` where the model cannot run on the data set.
 pub(super) fn check(loaded: &Model, dataset: &Dataset) -> Result<(), EvaluationError> {
-    let (spec, info) = (loaded.spec(), dataset.info());
+    check_fit(&loaded.manifest, dataset.info())
+}
+
+/// The same by their descriptions alone. Errors: `Mismatch`.
+pub fn check_fit(model: &Manifest, info: &DatasetInfo) -> Result<(), EvaluationError> {
+    let spec = &model.spec;
     let mismatch = |found: String, wanted: String| {
         Err(EvaluationError::Mismatch {
             dataset: info.name.clone(),
             found,
-            model: loaded.manifest.name.clone(),
+            model: model.name.clone(),
             wanted,
         })
     };

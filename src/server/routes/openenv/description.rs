@@ -1,7 +1,8 @@
 //! What `OpenEnv`'s tools read about an environment.
 
 use axum::body::Bytes;
-use serde::Deserialize;
+use axum::http::StatusCode;
+use axum::response::{IntoResponse as _, Response};
 use serde_json::{Value, json};
 
 use super::NamedScenario;
@@ -74,21 +75,38 @@ pub(super) fn openapi(scenario: Scenario) -> Value {
     })
 }
 
-/// A request of the Model Context Protocol.
-#[derive(Deserialize)]
-struct McpRequest {
-    id: Option<Value>,
-    method: String,
+// The errors of JSON-RPC.
+const PARSE_ERROR: i32 = -32700;
+const INVALID_REQUEST: i32 = -32600;
+const METHOD_NOT_FOUND: i32 = -32601;
+
+/// Answers the Model Context Protocol: the environment has no tools. A notification gets an empty answer.
+pub(super) async fn mcp(_: NamedScenario, body: Bytes) -> Response {
+    match mcp_answer(&body) {
+        Some(answer) => axum::Json(answer).into_response(),
+        None => StatusCode::ACCEPTED.into_response(),
+    }
 }
 
-/// Answers the Model Context Protocol: the environment has no tools.
-pub(super) async fn mcp(_: NamedScenario, body: Bytes) -> axum::Json<Value> {
-    let failed = |id: Value, code: i32, message: &str| json!({"jsonrpc": "2.0", "id": id, "error": {"code": code, "message": message}});
-    axum::Json(match serde_json::from_slice::<McpRequest>(&body) {
-        Ok(McpRequest { id, method }) if method == "tools/list" => {
-            json!({"jsonrpc": "2.0", "id": id, "result": {"tools": []}})
-        }
-        Ok(McpRequest { id, .. }) => failed(id.unwrap_or_default(), -32601, "this environment only has tools/list"),
-        Err(_) => failed(Value::Null, -32600, "not a request of JSON-RPC"),
-    })
+/// `None` for a notification.
+fn mcp_answer(body: &[u8]) -> Option<Value> {
+    let failed = |id: Value, code: i32, message: &str| {
+        Some(json!({"jsonrpc": "2.0", "id": id, "error": {"code": code, "message": message}}))
+    };
+    let Ok(request) = serde_json::from_slice::<Value>(body) else {
+        return failed(Value::Null, PARSE_ERROR, "the body is not JSON");
+    };
+    let invalid = || failed(Value::Null, INVALID_REQUEST, "not a request of JSON-RPC 2.0");
+    let (Some("2.0"), Some(method)) = (request["jsonrpc"].as_str(), request["method"].as_str()) else {
+        return invalid();
+    };
+    // An id that is null is an id; without one, nobody waits for the answer.
+    match request.get("id") {
+        None => None,
+        Some(id @ (Value::String(_) | Value::Number(_) | Value::Null)) => match method {
+            "tools/list" => Some(json!({"jsonrpc": "2.0", "id": id, "result": {"tools": []}})),
+            _ => failed(id.clone(), METHOD_NOT_FOUND, "this environment only has tools/list"),
+        },
+        Some(_) => invalid(),
+    }
 }

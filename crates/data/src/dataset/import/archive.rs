@@ -4,8 +4,9 @@ mod tar;
 mod unpacker;
 mod zip_file;
 
+use std::fs;
 use std::path::{Path, PathBuf};
-use std::sync::atomic::AtomicBool;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use flate2::read::MultiGzDecoder;
 
@@ -46,22 +47,41 @@ pub(super) struct UnpackedSource {
     /// The recording.
     pub(super) path: PathBuf,
     folder: PathBuf,
+    /// The archive, and the folder that stands for it; `None` if the source is none.
+    archive: Option<ArchiveFolder>,
+}
+
+struct ArchiveFolder {
+    archive: PathBuf,
+    folder: PathBuf,
 }
 
 impl UnpackedSource {
     /// Unpacks the source, if it is an archive. Errors: `Archive`, `Io`, `Stopped`.
     pub(super) fn of(config: &ImportConfig, cancelled: &AtomicBool) -> Result<Self, ImportError> {
         let (source, folder) = (&config.source, config.out.join(UNPACKED));
-        // What a killed import left.
+        // What a killed import left: first file by file, since there may be very many.
+        if folder.is_dir() {
+            empty(&folder, cancelled)?;
+        }
         remove_dir(&folder).map_err(ImportError::io("delete", &folder))?;
         let Some((packing, stem)) = packing(source).filter(|_| source.is_file()) else {
             let path = source.clone();
-            return Ok(Self { path, folder });
+            return Ok(Self {
+                path,
+                folder,
+                archive: None,
+            });
         };
+        let root = folder.join(stem);
         // The folder has the archive's name, which becomes the recording's.
         let mut unpacked = Self {
-            path: folder.join(stem),
+            path: root.clone(),
             folder,
+            archive: Some(ArchiveFolder {
+                archive: source.clone(),
+                folder: root,
+            }),
         };
         let mut unpacker = Unpacker::new(config, &unpacked.path, cancelled)?;
         let file = open_file(source)?;
@@ -73,6 +93,32 @@ impl UnpackedSource {
         unpacked.path = recording_in(&unpacked.path)?;
         Ok(unpacked)
     }
+
+    /// The same error, with paths in the archive instead of those of the unpacked files, which are gone when somebody reads it.
+    pub(super) fn name_in_archive(&self, error: ImportError) -> ImportError {
+        match &self.archive {
+            Some(ArchiveFolder { archive, folder }) => error.moved(folder, archive),
+            None => error,
+        }
+    }
+}
+
+/// Deletes what is in a folder. Errors: `Io`, `Stopped`.
+fn empty(folder: &Path, cancelled: &AtomicBool) -> Result<(), ImportError> {
+    for path in entries(folder)? {
+        if cancelled.load(Ordering::Relaxed) {
+            return Err(ImportError::Stopped);
+        }
+        let is_folder = path.symlink_metadata().is_ok_and(|found| found.is_dir());
+        let deleted = if is_folder {
+            empty(&path, cancelled)?;
+            fs::remove_dir(&path)
+        } else {
+            fs::remove_file(&path)
+        };
+        deleted.map_err(ImportError::io("delete", &path))?;
+    }
+    Ok(())
 }
 
 impl Drop for UnpackedSource {
@@ -97,6 +143,18 @@ fn recording_in(folder: &Path) -> Result<PathBuf, ImportError> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_deletion_of_what_was_left_can_be_stopped() {
+        let dir = tempfile::tempdir().unwrap();
+        let inner = dir.path().join("left/inner");
+        fs::create_dir_all(&inner).unwrap();
+        fs::write(inner.join("0.png"), "x").unwrap();
+        let stopped = empty(dir.path(), &AtomicBool::new(true));
+        assert!(matches!(stopped, Err(ImportError::Stopped)) && inner.join("0.png").is_file());
+        empty(dir.path(), &AtomicBool::new(false)).unwrap();
+        assert!(dir.path().is_dir() && !dir.path().join("left").exists());
+    }
 
     #[test]
     fn the_ending_of_the_name_tells_an_archive() {

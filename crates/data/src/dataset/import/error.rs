@@ -157,6 +157,38 @@ impl ImportError {
         }
     }
 
+    /// The same error with the paths below one folder as paths below another.
+    pub(super) fn moved(self, from: &Path, to: &Path) -> Self {
+        let moved = |path: PathBuf| match path.strip_prefix(from) {
+            Ok(rest) if rest.as_os_str().is_empty() => to.to_owned(),
+            Ok(rest) => to.join(rest),
+            Err(_) => path,
+        };
+        let [from_text, to_text] = [from, to].map(|path| path.display().to_string());
+        let text = |text: String| text.replace(&from_text, &to_text);
+        match self {
+            Self::UnknownSource(path) => Self::UnknownSource(moved(path)),
+            Self::Option(reason) => Self::Option(text(reason)),
+            Self::Program(reason) => Self::Program(text(reason)),
+            Self::Empty(path) => Self::Empty(moved(path)),
+            Self::Io { action, path, source } => Self::Io {
+                action,
+                path: moved(path),
+                source,
+            },
+            Self::Record { place, reason } => Self::Record {
+                place: text(place),
+                reason: text(reason),
+            },
+            Self::Image { place, path, source } => Self::Image {
+                place: text(place),
+                path: moved(path),
+                source,
+            },
+            other => other,
+        }
+    }
+
     /// Lists what is damaged, if it may be left out. Errors: itself, if not, or if it is no damage of a single item.
     pub(super) fn leave_out(self, skip_bad: bool, skipped: &mut SkippedList) -> Result<(), Self> {
         skipped.push(match &self {

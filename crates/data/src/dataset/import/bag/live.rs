@@ -1,4 +1,8 @@
-//! Messages of a running robot, one by one: the types that bags have, in CDR, and the images of Foxglove in Protocol Buffers.
+//! Messages of a running robot, one by one: the types that bags have, in CDR, and the images of Foxglove in Protocol Buffers or JSON.
+
+use base64::Engine as _;
+use base64::engine::general_purpose::STANDARD;
+use serde::Deserialize;
 
 use super::messages::{self, RosType};
 use super::pixels::RawImage;
@@ -25,6 +29,7 @@ enum MessageDecoder {
     Ros(RosType),
     FoxgloveRawImage,
     FoxgloveCompressedImage,
+    JsonImage,
 }
 
 /// A number of a message by its name, as `linear.x`.
@@ -51,6 +56,7 @@ impl LiveType {
         let decoder = match (encoding, type_name) {
             ("protobuf", "foxglove.RawImage") => MessageDecoder::FoxgloveRawImage,
             ("protobuf", "foxglove.CompressedImage") => MessageDecoder::FoxgloveCompressedImage,
+            ("json", "foxglove.RawImage" | "foxglove.CompressedImage") => MessageDecoder::JsonImage,
             ("cdr", ros) => MessageDecoder::Ros(RosType::of(ros)),
             _ => return None,
         };
@@ -66,7 +72,9 @@ impl LiveType {
             MessageDecoder::Ros(kind) if kind.is_command() => Some(LiveRole::Command),
             MessageDecoder::Ros(kind) if kind.is_measurement() => Some(LiveRole::Measurement),
             MessageDecoder::Ros(_) => None,
-            MessageDecoder::FoxgloveRawImage | MessageDecoder::FoxgloveCompressedImage => Some(LiveRole::Image),
+            MessageDecoder::FoxgloveRawImage | MessageDecoder::FoxgloveCompressedImage | MessageDecoder::JsonImage => {
+                Some(LiveRole::Image)
+            }
         }
     }
 
@@ -74,6 +82,7 @@ impl LiveType {
     pub fn image(self, message: &[u8]) -> Result<Frame, String> {
         let file = match self.0 {
             MessageDecoder::Ros(RosType::Image) => return messages::image(message)?.1.gray(),
+            MessageDecoder::JsonImage => return json_image(message),
             MessageDecoder::FoxgloveRawImage => return raw_image(message)?.gray(),
             MessageDecoder::Ros(_) => messages::compressed_image(message)?.2,
             MessageDecoder::FoxgloveCompressedImage => bytes_of(message, COMPRESSED_DATA).unwrap_or_default(),
@@ -108,6 +117,48 @@ fn raw_image(message: &[u8]) -> Result<RawImage<'_>, String> {
     })
 }
 
+/// An image of Foxglove in JSON, compressed or raw. Unknown fields are ignored: time and coordinate frame.
+#[derive(Deserialize)]
+struct JsonImage {
+    /// In base64.
+    data: String,
+    #[serde(flatten)]
+    raw: Option<JsonPixels>,
+}
+
+/// What only a raw image has.
+#[derive(Deserialize)]
+struct JsonPixels {
+    width: u32,
+    height: u32,
+    encoding: String,
+    step: u32,
+}
+
+fn json_image(message: &[u8]) -> Result<Frame, String> {
+    let JsonImage { data, raw } = serde_json::from_slice(message).map_err(|error| error.to_string())?;
+    let bytes = STANDARD
+        .decode(data)
+        .map_err(|error| format!("its data is not base64: {error}"))?;
+    match raw {
+        None => codec::decode(&bytes).map_err(|error| error.to_string()),
+        Some(JsonPixels {
+            width,
+            height,
+            encoding,
+            step,
+        }) => RawImage {
+            width_px: width,
+            height_px: height,
+            encoding: &encoding,
+            big_endian: false,
+            row_bytes: step,
+            bytes: &bytes,
+        }
+        .gray(),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -121,6 +172,23 @@ mod tests {
         assert_eq!((frame.width(), frame.height(), frame.pixels()), (3, 2, &b"abcdef"[..]));
         assert!(kind.image(&message[..20]).is_err() && kind.values(message).is_err());
         assert!(kind.image(b"").unwrap_err().contains("its encoding is \"\""));
+    }
+
+    #[test]
+    fn images_of_foxglove_in_json_are_read() {
+        let [raw, compressed] =
+            ["RawImage", "CompressedImage"].map(|name| LiveType::of("json", &format!("foxglove.{name}")).unwrap());
+        assert_eq!(raw.role(), Some(LiveRole::Image));
+        let time = r#""timestamp":{"sec":1,"nsec":2},"frame_id":"camera""#;
+        let message = format!(r#"{{{time},"width":3,"height":2,"encoding":"mono8","step":3,"data":"YWJjZGVm"}}"#);
+        let frame = raw.image(message.as_bytes()).unwrap();
+        assert_eq!((frame.width(), frame.height(), frame.pixels()), (3, 2, &b"abcdef"[..]));
+        let png = STANDARD.encode(codec::encode_png(&frame).unwrap());
+        let message = format!(r#"{{{time},"format":"png","data":"{png}"}}"#);
+        assert_eq!(compressed.image(message.as_bytes()).unwrap().pixels(), b"abcdef");
+        for wrong in ["", "{}", r#"{"data":"?"}"#, r#"{"data":""}"#] {
+            assert!(raw.image(wrong.as_bytes()).is_err(), "{wrong}");
+        }
     }
 
     #[test]
