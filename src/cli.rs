@@ -34,6 +34,7 @@ mod recorded;
 mod scores;
 mod serve;
 mod settings;
+mod sweep_table;
 mod table;
 mod train;
 mod worker;

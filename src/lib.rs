@@ -68,8 +68,8 @@ pub mod images {
 pub mod sim {
     pub use foreframe_sim::pid::Gains;
     pub use foreframe_sim::{
-        CameraConfig, CrossingHabits, Environment, Look, Observation, PidGains, PlanarPose, RoomSet, Route, Scenario,
-        SimError, StepResult, TrialParameters, TrialRoom, World, WorldConfig, action_channels, state_channels,
+        CameraConfig, Environment, Look, Observation, PidGains, PlanarPose, RoomSet, Route, Scenario, SimError,
+        StepResult, TrialParameters, TrialRoom, World, WorldConfig, action_channels, state_channels,
     };
 }
 

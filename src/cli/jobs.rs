@@ -7,11 +7,12 @@ use indicatif::HumanDuration;
 use super::error::CliError;
 use super::process::print_line;
 use super::settings::{CommonArgs, open_store, with_checked_directories};
+use super::sweep_table;
 use super::table::aligned;
 use super::workspace::{Workspace, block_on};
 use crate::server::start_jobs;
 use foreframe_core::error_text::comma_separated;
-use foreframe_jobs::jobs::{Job, JobFilter, JobState, Jobs};
+use foreframe_jobs::jobs::{Job, JobFilter, JobParts, JobState, Jobs};
 use foreframe_jobs::store::{Author, JobId};
 
 /// Lines of a log that are read at once.
@@ -42,6 +43,9 @@ enum JobsCommand {
         /// Only jobs in that state: queued, running, succeeded, failed or cancelled
         #[arg(long)]
         state: Option<JobState>,
+        /// Only the parts of that job; without it, the list has no parts
+        #[arg(long, value_name = "JOB")]
+        part_of: Option<JobId>,
         /// How many at most
         #[arg(long, default_value_t = 50)]
         limit: u32,
@@ -87,7 +91,20 @@ pub(super) fn run(args: &JobsArgs) -> Result<(), CliError> {
         let store = open_store(&workspace.config).await?;
         let jobs = start_jobs(server, &store, &versions, false)?;
         match &args.action {
-            JobsCommand::List { state, limit, json } => list(&jobs, *state, *limit, *json).await,
+            JobsCommand::List {
+                state,
+                part_of,
+                limit,
+                json,
+            } => {
+                let filter = JobFilter {
+                    state: *state,
+                    part_of: part_of.map(|id| id.to_string()),
+                    limit: *limit as usize,
+                    ..JobFilter::default()
+                };
+                list(&jobs, filter, *json).await
+            }
             JobsCommand::Show { id, json } => show(&jobs.get(*id).await?, *json),
             JobsCommand::Log { id } => log(&jobs, *id).await,
             JobsCommand::Cancel { id } => cancel(&jobs, *id).await,
@@ -95,12 +112,7 @@ pub(super) fn run(args: &JobsArgs) -> Result<(), CliError> {
     })
 }
 
-async fn list(jobs: &Jobs, state: Option<JobState>, limit: u32, is_json: bool) -> Result<(), CliError> {
-    let filter = JobFilter {
-        state,
-        limit: limit as usize,
-        ..JobFilter::default()
-    };
+async fn list(jobs: &Jobs, filter: JobFilter, is_json: bool) -> Result<(), CliError> {
     let found = jobs.list(filter).await?;
     if is_json {
         return print_line(serde_json::to_string_pretty(&found).map_err(CliError::failed)?);
@@ -146,6 +158,17 @@ fn show(job: &Job, is_json: bool) -> Result<(), CliError> {
     print_line(format!("{}: {}, {}", job.id, job.spec.kind(), state(job)))?;
     print_line(format!("  asked for  {spec}"))?;
     print_line(format!("  done       {} {}", share_done(job), job.progress.message))?;
+    if let Some(parts) = &job.parts {
+        let JobParts {
+            total,
+            done,
+            running,
+            failed,
+        } = parts;
+        print_line(format!(
+            "  parts      {total}: {done} done, {running} running, {failed} failed"
+        ))?;
+    }
     if let Some(left_s) = job
         .progress
         .remaining_s
@@ -161,9 +184,16 @@ fn show(job: &Job, is_json: bool) -> Result<(), CliError> {
     if let Some(error) = &job.error {
         print_line(format!("  error      {error}"))?;
     }
-    job.result
-        .as_ref()
-        .map_or(Ok(()), |result| print_line(format!("  result     {result}")))
+    match &job.result {
+        Some(result) => match sweep_table::rows_of(result) {
+            Some(rows) => {
+                let mut lines = sweep_table::lines(&rows, "version").into_iter();
+                lines.try_for_each(|line| print_line(format!("  {line}")))
+            }
+            None => print_line(format!("  result     {result}")),
+        },
+        None => Ok(()),
+    }
 }
 
 async fn log(jobs: &Jobs, id: JobId) -> Result<(), CliError> {

@@ -1,8 +1,12 @@
 //! `foreframe train`
 
-use std::path::PathBuf;
-use std::str::FromStr;
+mod sweep;
 
+use std::path::{Path, PathBuf};
+use std::str::FromStr;
+use std::sync::atomic::AtomicBool;
+
+use self::sweep::SweepRun;
 use super::error::CliError;
 use super::interrupt;
 use super::next_step::shell_path;
@@ -11,11 +15,11 @@ use super::progress::ProgressLine;
 use super::settings::DirectoryArgs;
 use super::workspace::Workspace;
 use crate::config::is_setting;
-use foreframe_core::registry::StoredWeights;
+use foreframe_core::registry::{Manifest, StoredWeights};
 use foreframe_data::dataset::Dataset;
 use foreframe_train::evaluation;
 use foreframe_train::settings::SettingsLayer;
-use foreframe_train::training::{self, TrainConfig, Training, TrainingEvent, TrainingOutcome, TrainingStage};
+use foreframe_train::training::{self, Sweep, TrainConfig, Training, TrainingEvent, TrainingOutcome, TrainingStage};
 
 /// Train a model on a data set.
 ///
@@ -26,6 +30,7 @@ use foreframe_train::training::{self, TrainConfig, Training, TrainingEvent, Trai
 #[command(after_help = "Examples:
   foreframe train --preset paper --dataset static-observer
   foreframe train --preset moving --set seed=2 --set sequence.steps=4000 --out runs/moving-2
+  foreframe train --preset moving --sweep seed=1..3 --sweep model.hidden=64,128
   foreframe train --preset paper --print-config > mine.toml
   foreframe train --preset paper --config mine.toml
   foreframe train --from moving-flow --dataset mine --set name=mine --set sequence.steps=300
@@ -55,6 +60,10 @@ pub(super) struct TrainArgs {
     /// replaces that of --config
     #[arg(long = "set", value_name = "KEY=VALUE")]
     settings: Vec<String>,
+    /// Train once for each value of a setting, as in seed=1..3 (1, 2 and 3) or model.hidden=64,128; if repeated, for each
+    /// combination, at most 64. Prints a table, the lowest validation error first. Each run has a directory below --out
+    #[arg(long = "sweep", value_name = "KEY=VALUES")]
+    sweep: Vec<String>,
     /// Print the training settings and stop
     #[arg(long)]
     print_config: bool,
@@ -70,7 +79,14 @@ pub(super) fn run(args: &TrainArgs) -> Result<(), CliError> {
         .as_ref()
         .map(|model| workspace.load_weights(model))
         .transpose()?;
-    let config = training_config(args, start.as_ref(), settings.training)?;
+    let config = training_config(args, start.as_ref(), settings.training.clone())?;
+    let points = Sweep::parse(args.sweep.iter().map(String::as_str))?.points();
+    // All configurations are checked before the first training starts.
+    let configs = points.iter().map(|point| {
+        let layers = settings.training.iter().cloned().chain([sweep::layer(point)]);
+        training_config(args, start.as_ref(), layers.collect())
+    });
+    let configs = configs.collect::<Result<Vec<_>, _>>()?;
     if args.print_config {
         return print_line(config.to_toml()?.trim_end());
     }
@@ -91,43 +107,76 @@ pub(super) fn run(args: &TrainArgs) -> Result<(), CliError> {
         .clone()
         .unwrap_or_else(|| PathBuf::from("runs").join(&config.name));
     let (command, flags) = (command_line(), args.directories.repeated());
-    let training = Training {
-        config: &config,
+    let cancelled = interrupt::flag()?;
+    let one = OneTraining {
         dataset: &dataset,
-        run_dir: &run_dir,
         command: &command,
         start: start.as_ref(),
+        cancelled: &cancelled,
     };
-    let cancelled = interrupt::flag()?;
-    let progress = ProgressLine::new("steps");
-    let mut display = TrainingDisplay::new(&progress, &config);
-    let outcome = training::run(
-        &training,
-        &mut |event: TrainingEvent| display.on_event(event),
-        &cancelled,
-    );
-    progress.finish();
-    match outcome? {
-        TrainingOutcome::Finished { model_dir, manifest } => {
-            evaluation::calibrate_trained(&model_dir, &dataset, &cancelled).map_err(CliError::not_calibrated)?;
-            let evaluations = directories.iter().map(|directory| {
-                let (model, dataset) = (shell_path(&model_dir), shell_path(directory));
-                format!("foreframe evaluate --model {model} --dataset {dataset}{flags}\n      ")
-            });
-            print_line(format!(
-                "{}: {} parameters, validation MSE {:.6} at step {}\nnext: {}foreframe publish {}{flags}",
-                model_dir.display(),
-                manifest.parameters,
-                manifest.metrics["validation"]["mse"].as_f64().unwrap_or(f64::NAN),
-                manifest.metrics["validation"]["step"],
-                evaluations.collect::<String>(),
-                shell_path(&run_dir),
-            ))
+    if !args.sweep.is_empty() {
+        let runs = points.into_iter().zip(configs);
+        let mut finished = Vec::new();
+        for (point, config) in runs {
+            let run = SweepRun::new(point, config, &run_dir);
+            let (_, manifest) = one.run(&run.config, &run.run_dir)?;
+            finished.push((run, manifest));
         }
-        TrainingOutcome::Interrupted { stage, step } => Err(CliError::Interrupted(format!(
-            "stopped in {stage} after step {step}; the checkpoint is in {}, and the same command continues from it",
-            run_dir.display()
-        ))),
+        return sweep::print_table(&finished, &flags);
+    }
+    let (model_dir, manifest) = one.run(&config, &run_dir)?;
+    let evaluations = directories.iter().map(|directory| {
+        let (model, dataset) = (shell_path(&model_dir), shell_path(directory));
+        format!("foreframe evaluate --model {model} --dataset {dataset}{flags}\n      ")
+    });
+    print_line(format!(
+        "{}: {} parameters, validation MSE {:.6} at step {}\nnext: {}foreframe publish {}{flags}",
+        model_dir.display(),
+        manifest.parameters,
+        manifest.metrics["validation"]["mse"].as_f64().unwrap_or(f64::NAN),
+        manifest.metrics["validation"]["step"],
+        evaluations.collect::<String>(),
+        shell_path(&run_dir),
+    ))
+}
+
+/// What all trainings of a command share.
+struct OneTraining<'a> {
+    dataset: &'a Dataset,
+    command: &'a str,
+    start: Option<&'a StoredWeights>,
+    cancelled: &'a AtomicBool,
+}
+
+impl OneTraining<'_> {
+    /// Trains and calibrates a model, or continues. Returns its directory and its description.
+    fn run(&self, config: &TrainConfig, run_dir: &Path) -> Result<(PathBuf, Box<Manifest>), CliError> {
+        let training = Training {
+            config,
+            dataset: self.dataset,
+            run_dir,
+            command: self.command,
+            start: self.start,
+        };
+        let progress = ProgressLine::new("steps");
+        let mut display = TrainingDisplay::new(&progress, config);
+        let outcome = training::run(
+            &training,
+            &mut |event: TrainingEvent| display.on_event(event),
+            self.cancelled,
+        );
+        progress.finish();
+        match outcome? {
+            TrainingOutcome::Finished { model_dir, manifest } => {
+                let calibrated = evaluation::calibrate_trained(&model_dir, self.dataset, self.cancelled);
+                calibrated.map_err(CliError::not_calibrated)?;
+                Ok((model_dir, manifest))
+            }
+            TrainingOutcome::Interrupted { stage, step } => Err(CliError::Interrupted(format!(
+                "stopped in {stage} after step {step}; the checkpoint is in {}, and the same command continues from it",
+                run_dir.display()
+            ))),
+        }
     }
 }
 

@@ -28,7 +28,7 @@ impl Drop for KillOnDrop {
 }
 
 /// Starts the program with a data directory and no shipped models. Returns also its first line of output.
-fn start(data_dir: &Path, arguments: &[&str]) -> (KillOnDrop, String) {
+pub(crate) fn start(data_dir: &Path, arguments: &[&str]) -> (KillOnDrop, String) {
     let no_models = data_dir.join("none-shipped");
     std::fs::create_dir_all(&no_models).unwrap();
     let mut child = Command::new(env!("CARGO_BIN_EXE_foreframe"))

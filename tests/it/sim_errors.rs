@@ -10,7 +10,7 @@ fn an_unknown_scenario_is_refused_with_the_known_ones() {
     let error = "static".parse::<Scenario>().unwrap_err();
     assert_eq!(
         error.to_string(),
-        "there is no scenario \"static\"; there are static-observer, moving-observer, crowded"
+        "there is no scenario \"static\"; there are static-observer, moving-observer, crowded, crossing"
     );
     for scenario in Scenario::ALL {
         assert_eq!(scenario.to_string().parse::<Scenario>().unwrap(), scenario);

@@ -47,7 +47,7 @@ pub(crate) async fn postgres(name: &str) -> Option<String> {
     Some(format!("{server}/{database}"))
 }
 
-async fn stores(name: &str) -> Vec<(TempDir, Store)> {
+pub(crate) async fn stores(name: &str) -> Vec<(TempDir, Store)> {
     let mut stores = Vec::new();
     for (dir, config) in configs(name).await {
         stores.push((dir, Store::open(&config).await.unwrap()));
@@ -59,7 +59,7 @@ async fn find_key(store: &Store, id: &str) -> Option<KeyRow> {
     store.list_keys().await.unwrap().into_iter().find(|key| key.id == id)
 }
 
-fn job(makes: Option<&str>, key: Option<&str>) -> NewJob {
+pub(crate) fn job(makes: Option<&str>, key: Option<&str>) -> NewJob {
     NewJob {
         kind: "collect".to_owned(),
         exclusive_output: makes.map(str::to_owned),
@@ -68,6 +68,7 @@ fn job(makes: Option<&str>, key: Option<&str>) -> NewJob {
         idempotency_key: key.map(str::to_owned),
         submitter: String::new(),
         after: None,
+        parts: Vec::new(),
     }
 }
 
@@ -78,7 +79,7 @@ async fn enqueued(store: &Store) -> JobRow {
     }
 }
 
-fn outcome(state: &'static str) -> JobOutcome {
+pub(crate) fn outcome(state: &'static str) -> JobOutcome {
     JobOutcome {
         state,
         error: None,
@@ -291,6 +292,7 @@ async fn jobs_are_listed_newest_first_and_old_ones_deleted() {
             before: Some(JobId::new(4)),
             limit: 2,
             state: None,
+            part_of: None,
         };
         assert_eq!(ids(page).await, [3, 2].map(JobId::new));
         assert_eq!(

@@ -16,6 +16,7 @@ async fn store(dir: &std::path::Path) -> Store {
         idempotency_key: None,
         submitter: String::new(),
         after: None,
+        parts: Vec::new(),
     };
     store.enqueue(new, 10, 0.0).await.unwrap();
     store

@@ -24,6 +24,7 @@ async fn enqueue(store: &Store) -> Result<EnqueueResult, StoreError> {
         idempotency_key: None,
         submitter: String::new(),
         after: None,
+        parts: Vec::new(),
     };
     store.enqueue(new, 1_000_000, 0.0).await
 }

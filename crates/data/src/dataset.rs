@@ -31,7 +31,9 @@ pub mod import;
 pub mod export;
 
 pub use collect::moving_mnist;
-pub use collect::{CollectConfig, CollectProgress, CollectionStatus, collect};
+pub use collect::{
+    CollectConfig, CollectProgress, CollectionStatus, DEFAULT_TRIALS_PER_SHARD, collect, collect_part, take_parts,
+};
 pub use error::DatasetError;
 pub use foreframe_sim::TrialParameters;
 pub use info::{DatasetInfo, DatasetPart, Episode, EpisodeData};

@@ -29,7 +29,7 @@ use foreframe_core::types::DatasetName;
 use foreframe_data::dataset::DatasetError;
 
 pub use executor::{JobExecutor, JobFailure, JobResult};
-pub use job::{Job, JobFilter};
+pub use job::{Job, JobFilter, JobParts};
 pub use progress::{JobProgress, Losses};
 pub use queue::Jobs;
 pub use report::JobReporter;

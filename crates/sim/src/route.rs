@@ -56,6 +56,7 @@ pub struct Route {
     pub gains: PidGains,
     /// For a robot that drives to and fro between its start and its goal: what else it does. Others get goals anywhere.
     #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[doc(hidden)]
     pub crossing: Option<CrossingHabits>,
 }
 

@@ -22,6 +22,7 @@ mod shuffle;
 mod stage;
 mod start;
 mod state;
+pub mod sweep;
 
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
@@ -37,6 +38,7 @@ pub use self::observer::{Observer, TrainingEvent, TrainingStage};
 use self::plan::{TrainingPlan, window_frames};
 use self::stage::{StageEnd, StageRunner};
 use self::state::TrainState;
+pub use self::sweep::Sweep;
 use foreframe_core::files::write_atomically;
 use foreframe_core::nn::Parameters;
 use foreframe_core::registry::{self, Manifest, StoredWeights};

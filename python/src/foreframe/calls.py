@@ -243,9 +243,10 @@ def delete_dataset(name: str) -> Call[None]:
     return Call("DELETE", path("datasets", name), _nothing)
 
 
-def jobs(kind: str | None, state: str | None, limit: int | None) -> Call[list[Job]]:
+def jobs(kind: str | None, state: str | None, part_of: str | None, limit: int | None) -> Call[list[Job]]:
     read = _page("jobs", Job.of)
-    return Call("GET", path("jobs"), lambda body: read(body)[0], params=given(kind=kind, state=state, limit=limit))
+    params = given(kind=kind, state=state, part_of=part_of, limit=limit)
+    return Call("GET", path("jobs"), lambda body: read(body)[0], params=params)
 
 
 def job(job_id: str) -> Call[Job]:

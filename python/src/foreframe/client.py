@@ -256,9 +256,16 @@ class Client:
         """Deletes a data set."""
         self.run(calls.delete_dataset(name))
 
-    def jobs(self, *, kind: str | None = None, state: str | None = None, limit: int | None = None) -> list[Job]:
-        """The newest jobs."""
-        return self.run(calls.jobs(kind, state, limit))
+    def jobs(
+        self,
+        *,
+        kind: str | None = None,
+        state: str | None = None,
+        part_of: str | None = None,
+        limit: int | None = None,
+    ) -> list[Job]:
+        """The newest jobs that are no parts, or the parts of one job."""
+        return self.run(calls.jobs(kind, state, part_of, limit))
 
     def job(self, job_id: str) -> Job:
         """A job and its progress."""
@@ -524,9 +531,16 @@ class AsyncClient:
         """Deletes a data set."""
         await self.run(calls.delete_dataset(name))
 
-    async def jobs(self, *, kind: str | None = None, state: str | None = None, limit: int | None = None) -> list[Job]:
-        """The newest jobs."""
-        return await self.run(calls.jobs(kind, state, limit))
+    async def jobs(
+        self,
+        *,
+        kind: str | None = None,
+        state: str | None = None,
+        part_of: str | None = None,
+        limit: int | None = None,
+    ) -> list[Job]:
+        """The newest jobs that are no parts, or the parts of one job."""
+        return await self.run(calls.jobs(kind, state, part_of, limit))
 
     async def job(self, job_id: str) -> Job:
         """A job and its progress."""

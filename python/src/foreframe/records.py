@@ -351,6 +351,10 @@ class Job:
     error: str | None
     result: Mapping[str, Any] = field(default_factory=dict)
     spec: Mapping[str, Any] = field(default_factory=dict)
+    #: Of a job in parts, how many there are: ``total``, ``done``, ``running`` and ``failed``.
+    parts: Mapping[str, int] = field(default_factory=dict)
+    #: The job of which this one is a part.
+    part_of: str | None = None
 
     @property
     def is_over(self) -> bool:
@@ -372,6 +376,8 @@ class Job:
             error=body.get("error"),
             result=body.get("result") or {},
             spec=body["spec"],
+            parts=body.get("parts") or {},
+            part_of=body.get("part_of"),
         )
 
 

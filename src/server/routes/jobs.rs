@@ -61,6 +61,9 @@ struct ListQuery {
     /// Only jobs that are older than the one with this id.
     #[param(pattern = "^job-[0-9]{1,18}$")]
     before: Option<String>,
+    /// Only the parts of the job with this id. Without it, the list has no parts.
+    #[param(pattern = "^job-[0-9]{1,18}$")]
+    part_of: Option<String>,
     /// The maximum number of jobs, 1 to 1000. Default: 50.
     #[param(minimum = 1, maximum = 1000)]
     limit: Option<usize>,
@@ -153,6 +156,7 @@ async fn list(app: App, Query(query): Query<ListQuery>) -> Result<axum::Json<Job
         kind: query.kind,
         state: query.state,
         before: query.before,
+        part_of: query.part_of,
         limit: limit + 1,
     };
     let (jobs, next) = page::cut(app.jobs().list(filter).await?, limit, |job| job.id.to_string());
@@ -165,7 +169,7 @@ async fn get(app: App, Path(id): Path<String>) -> Result<axum::Json<Job>, ApiErr
     Ok(axum::Json(app.jobs().get(job_id(&id)?).await?))
 }
 
-/// Cancels a job. A job that waits ends at once; a job that runs ends at its next checkpoint.
+/// Cancels a job with its parts. A job that waits ends at once; a job that runs ends at its next checkpoint.
 #[utoipa::path(
     post, path = "/v1/jobs/{id}/cancel",
     responses((status = 202, description = "It will stop", body = Job), (status = 409, description = "It has ended"))
@@ -174,7 +178,7 @@ async fn cancel(app: App, author: Author, Path(id): Path<String>) -> Result<impl
     Ok(accepted(app.jobs().cancel(job_id(&id)?, &author).await?))
 }
 
-/// Resumes a job that failed or was cancelled, from its checkpoint. The result is the same as without the stop.
+/// Resumes a job that failed or was cancelled, from its checkpoint, with those of its parts that failed or were cancelled. The result is the same as without the stop.
 #[utoipa::path(
     post, path = "/v1/jobs/{id}/resume",
     responses(

@@ -8,6 +8,7 @@ mod config;
 mod digits;
 mod extend;
 pub mod moving_mnist;
+mod part;
 mod status;
 mod unfinished;
 
@@ -17,6 +18,7 @@ use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 
 use self::config::ShardTrials;
 pub use self::config::{CollectConfig, CollectProgress, DEFAULT_TRIALS_PER_SHARD};
+pub use self::part::{collect_part, take_parts};
 pub use self::status::CollectionStatus;
 use super::store::arguments::{arguments_text, lock};
 use super::store::shard::EncodedEpisode;
@@ -49,7 +51,9 @@ pub fn collect(
         config,
         info: writer.info().clone(),
         next_shard: AtomicUsize::new(writer.shard_count()),
+        end: shards.count(),
         done: AtomicU64::new(saved(&writer)),
+        total: config.trials,
         on_progress,
         cancelled,
         failed: AtomicBool::new(false),
@@ -64,7 +68,9 @@ pub fn collect(
         }
         drop(sender);
         let written = write_in_order(&mut writer, shards, receiver);
-        workers.failed.store(written.is_err(), Ordering::Relaxed);
+        if written.is_err() {
+            workers.fail();
+        }
         written
     });
     let unwritten = written?;
@@ -109,17 +115,31 @@ struct CollectWorkers<'a> {
     config: &'a CollectConfig,
     info: DatasetInfo,
     next_shard: AtomicUsize,
+    /// The end of the shards to simulate.
+    end: usize,
     done: AtomicU64,
+    total: u64,
     on_progress: &'a (dyn Fn(CollectProgress) + Sync),
     cancelled: &'a AtomicBool,
     failed: AtomicBool,
 }
 
 impl CollectWorkers<'_> {
+    /// The next shard that no thread has begun.
+    fn next_shard(&self) -> Option<usize> {
+        let shard = self.next_shard.fetch_add(1, Ordering::Relaxed);
+        (shard < self.end).then_some(shard)
+    }
+
+    /// Stops all threads.
+    fn fail(&self) {
+        self.failed.store(true, Ordering::Relaxed);
+    }
+
     fn report(&self, trials: u64) {
         (self.on_progress)(CollectProgress {
             done: self.done.fetch_add(trials, Ordering::Relaxed) + trials,
-            total: self.config.trials,
+            total: self.total,
         });
     }
 
@@ -129,11 +149,7 @@ impl CollectWorkers<'_> {
 
     /// Simulates shards until none is left, the collection is stopped, or the receiver is gone.
     fn work(&self, sender: &SyncSender<ShardResult>) {
-        loop {
-            let shard = self.next_shard.fetch_add(1, Ordering::Relaxed);
-            if shard >= self.config.shards().count() {
-                return;
-            }
+        while let Some(shard) = self.next_shard() {
             if sender.send((shard, self.simulate_shard(shard))).is_err() || self.is_stopped() {
                 return;
             }

@@ -4,7 +4,20 @@ use serde::Serialize;
 
 use super::progress::StoredProgress;
 use super::{JobError, JobProgress, JobSpec, JobState, Losses};
-use crate::store::{JobId, JobIdError, JobPage, JobRow};
+use crate::store::{JobId, JobIdError, JobPage, JobRow, PartCounts};
+
+/// The parts of a job: how many are in which state. The others wait.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, utoipa::ToSchema)]
+pub struct JobParts {
+    /// All of them.
+    pub total: u64,
+    /// Those that succeeded.
+    pub done: u64,
+    /// Those that a worker runs.
+    pub running: u64,
+    /// Those that failed or were cancelled.
+    pub failed: u64,
+}
 
 /// One job as it is now.
 #[derive(Clone, Debug, PartialEq, Serialize, utoipa::ToSchema)]
@@ -20,9 +33,17 @@ pub struct Job {
     pub progress: JobProgress,
     /// The latest losses of a training.
     pub losses: Losses,
+    /// Its parts, which any worker runs; absent if it is done as a whole. The job is `queued` until all of them have ended.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub parts: Option<JobParts>,
+    /// The job of which it is a part.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(value_type = Option<String>)]
+    pub part_of: Option<JobId>,
     /// Why it failed.
     pub error: Option<String>,
-    /// The result: the size of a data set, the version of a model, or the scores and files of an evaluation.
+    /// The result: the size of a data set, the version of a model, the scores and files of an evaluation, or
+    /// the table of a sweep.
     #[schema(value_type = Option<Object>)]
     pub result: Option<serde_json::Value>,
     /// Whether it is running and was asked to stop.
@@ -50,6 +71,11 @@ impl Job {
         if state != JobState::Running {
             progress.remaining_s = None;
         }
+        let parts = parts(row.parts);
+        if let (JobState::Queued, Some(parts)) = (state, parts) {
+            (progress.done, progress.total) = (parts.done + parts.failed, parts.total);
+            "its parts".clone_into(&mut progress.message);
+        }
         let outcome = row.outcome.as_deref().map(serde_json::from_str).transpose();
         Ok(Self {
             id: row.id,
@@ -57,6 +83,8 @@ impl Job {
             spec: serde_json::from_str(&row.spec).map_err(|error| record(error.to_string()))?,
             progress,
             losses: stored.losses,
+            parts,
+            part_of: row.parent.map(JobId::new),
             error: row.error.clone(),
             result: outcome.map_err(|error| record(error.to_string()))?,
             cancelling: row.cancelling,
@@ -69,6 +97,18 @@ impl Job {
     }
 }
 
+fn parts(counts: PartCounts) -> Option<JobParts> {
+    // Counts are never negative.
+    let [total, done, running, failed] = [counts.total, counts.done, counts.running, counts.failed]
+        .map(|count| u64::try_from(count).unwrap_or_default());
+    (total > 0).then_some(JobParts {
+        total,
+        done,
+        running,
+        failed,
+    })
+}
+
 /// Which jobs to list, the newest first.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct JobFilter {
@@ -78,6 +118,8 @@ pub struct JobFilter {
     pub state: Option<JobState>,
     /// Only those submitted before the job of that id.
     pub before: Option<String>,
+    /// Only the parts of the job of that id; `None` for the jobs that are no parts.
+    pub part_of: Option<String>,
     /// The maximum number of jobs.
     pub limit: usize,
 }
@@ -91,12 +133,15 @@ impl JobFilter {
             let reason = format!("there is no kind \"{kind}\"; there are: {kinds}");
             return Err(JobError::invalid("kind", reason));
         }
-        let before = self.before.map(|id| id.parse()).transpose();
-        let before = before.map_err(|error: JobIdError| JobError::invalid("before", error.to_string()))?;
+        let id = |field, id: Option<String>| {
+            let id = id.map(|id| id.parse()).transpose();
+            id.map_err(|error: JobIdError| JobError::invalid(field, error.to_string()))
+        };
         Ok(JobPage {
             kind: self.kind,
             state: self.state.map(|state| state.name().to_owned()),
-            before,
+            before: id("before", self.before)?,
+            part_of: id("part_of", self.part_of)?,
             limit: self.limit as i64,
         })
     }

@@ -48,14 +48,23 @@ impl JobMemory {
 
     /// What a training will need, without starting it. Errors: `Invalid`, `NotFound`, and those of reading the data sets.
     pub async fn estimate(self, spec: &TrainSpec, objects: &Objects) -> Result<TrainingEstimate, JobError> {
-        let config = spec.config()?;
         let mut dataset = datasets::describe(objects, &spec.dataset).await?;
         for name in spec.mixture.keys() {
             dataset.frame_count += datasets::describe(objects, name).await?.frame_count;
         }
+        let mut trainings = spec.parts();
+        if trainings.is_empty() {
+            trainings.push(spec.clone());
+        }
+        let (mut steps, mut memory_mib) = (0, 0);
+        for training in trainings {
+            let config = training.config()?;
+            steps += config.pretrain.steps + config.sequence.steps;
+            memory_mib = memory_mib.max(training_mib(&config, &dataset, self.held_mib()));
+        }
         Ok(TrainingEstimate {
-            steps: config.pretrain.steps + config.sequence.steps,
-            memory_mib: training_mib(&config, &dataset, self.held_mib()),
+            steps,
+            memory_mib,
             memory_limit_mib: self.limit_mib,
         })
     }
@@ -77,9 +86,9 @@ impl JobMemory {
 /// What a training will need.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, utoipa::ToSchema)]
 pub struct TrainingEstimate {
-    /// Updates of both stages.
+    /// Updates of both stages, of all trainings of a sweep.
     pub steps: usize,
-    /// The least memory that it needs, in MiB. What is hard to know is left out.
+    /// The least memory that it needs, in MiB; of a sweep, what its largest training needs. What is hard to know is left out.
     pub memory_mib: u64,
     /// The memory that a job can use, in MiB; 0 for no limit. A training that needs more is refused.
     pub memory_limit_mib: u64,

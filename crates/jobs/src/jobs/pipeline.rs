@@ -1,7 +1,9 @@
 //! The work of jobs, below the data directory: collections and imports write `datasets/NAME`; a training works in `runs/JOB` and
 //! publishes the next version of its model; an evaluation writes `reports/JOB`.
 
+mod collect;
 mod import;
+mod sweep;
 mod training_report;
 
 use std::error::Error;
@@ -20,14 +22,14 @@ use super::memory::JobMemory;
 use super::report::JobReporter;
 use super::retry_policy::RetryPolicy;
 use super::spec::AvailableInputs;
-use super::{CollectSpec, EvaluateSpec, Job, JobError, JobSpec, JobState, TrainSpec, datasets};
+use super::{EvaluateSpec, Job, JobError, JobSpec, JobState, TrainSpec, datasets};
 use crate::store::{JobId, ModelMetrics, Store, StoreError};
 use crate::versions::{VersionError, Versions};
 use foreframe_core::error_text;
 use foreframe_core::files::remove_dir;
 use foreframe_core::registry::Model;
 use foreframe_core::types::{DatasetName, ModelName, Seed};
-use foreframe_data::dataset::{self, CollectionStatus, Dataset, DatasetError, DatasetInfo};
+use foreframe_data::dataset::{Dataset, DatasetInfo};
 use foreframe_train::evaluation::{self, EvaluateConfig, EvaluationError};
 use foreframe_train::training::{self, CHECKPOINT_FILE, Training, TrainingEvent};
 
@@ -86,6 +88,9 @@ impl JobExecutor for Pipeline {
         let result = match spec {
             JobSpec::Collect(spec) => self.collect(spec, report, cancelled),
             JobSpec::Import(spec) => self.import(spec, report, cancelled),
+            JobSpec::Train(spec) if !spec.sweep.is_empty() => {
+                self.join_sweep(spec, report, &self.retry_policy(report, cancelled))
+            }
             JobSpec::Train(spec) => self.train(spec, report, cancelled),
             JobSpec::Evaluate(spec) => self.evaluate(spec, report, cancelled),
         };
@@ -195,32 +200,6 @@ impl Pipeline {
         let outcome: Option<Value> = row.and_then(|row| serde_json::from_str(&row.outcome?).ok());
         let made = outcome.filter(|outcome| outcome["model"] == model.as_str());
         Ok(made.and_then(|made| u32::try_from(made["version"].as_u64()?).ok()))
-    }
-
-    fn collect(
-        &self,
-        spec: &CollectSpec,
-        report: &JobReporter,
-        cancelled: &AtomicBool,
-    ) -> Result<JobResult, JobFailure> {
-        let parent = self.store.objects().data_dir().join("datasets");
-        let mut config = spec.config(&parent).map_err(|error| failed(&error))?;
-        config.threads = self.resources.threads;
-        let retry = self.retry_policy(report, cancelled);
-        let is_stale = |was_deleted| match CollectionStatus::of(&config) {
-            Err(DatasetError::OutExists { .. }) => was_deleted,
-            Err(DatasetError::OtherArguments { .. }) => true,
-            _ => false,
-        };
-        retry.run(async || datasets::clear_stale(self.store.objects(), &spec.name, is_stale).await)?;
-        // Whole shards are saved; a new attempt continues after them.
-        if let Ok(CollectionStatus::Unfinished { trials }) = CollectionStatus::of(&config) {
-            report.checkpoint(trials);
-        }
-        let on_progress = |now: dataset::CollectProgress| report.progress(now.done, now.total, "simulating");
-        // After an error it continues with the shards that are finished.
-        let info = retry.repeat_once_free(|| dataset::collect(&config, &on_progress, cancelled))?;
-        self.finish_dataset(&spec.name, &info, &retry).map(JobResult::of)
     }
 
     fn train(&self, spec: &TrainSpec, report: &JobReporter, cancelled: &AtomicBool) -> Result<JobResult, JobFailure> {

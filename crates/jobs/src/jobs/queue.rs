@@ -74,12 +74,13 @@ impl Jobs {
             idempotency_key: key,
             submitter: submitter.to_owned(),
             after: spec.after(),
+            parts: spec.parts().iter().map(json).collect::<Result<_, _>>()?,
         };
         let now_s = shared.store.now_s().await?;
         match shared.store.enqueue(new, shared.limits.queued as i64, now_s).await? {
             EnqueueResult::New(row) => {
                 shared.wake.notify_one();
-                let job = Job::of(&row)?;
+                let job = self.get(row.id).await?;
                 info!(job.id = %job.id, job.kind = row.kind, "job queued");
                 Ok(job)
             }
@@ -105,18 +106,9 @@ impl Jobs {
         rows.iter().map(Job::of).collect()
     }
 
-    /// All queued and running jobs. Errors: `Record`, `Store`.
+    /// All queued and running jobs, with their parts. Errors: `Record`, `Store`.
     pub async fn open(&self) -> Result<Vec<Job>, JobError> {
-        let mut open = Vec::new();
-        for state in [JobState::Queued, JobState::Running] {
-            let filter = JobFilter {
-                state: Some(state),
-                limit: self.shared.limits.queued + 1000,
-                ..JobFilter::default()
-            };
-            open.extend(self.list(filter).await?);
-        }
-        Ok(open)
+        self.shared.store.open_jobs().await?.iter().map(Job::of).collect()
     }
 
     /// One job. Errors: `Unknown`, `Record`, `Store`.
@@ -136,7 +128,7 @@ impl Jobs {
         Ok(self.shared.store.job_losses(row.id).await?)
     }
 
-    /// Cancels a job: a queued job ends at once, a running one as soon as its work has stopped.
+    /// Cancels a job with its parts: a queued job ends at once, a running one as soon as its work has stopped.
     /// Errors: `Unknown`, `IllegalTransition` if it has ended, `Store`.
     pub async fn cancel(&self, id: JobId, by: &Author) -> Result<Job, JobError> {
         let store = &self.shared.store;
@@ -157,9 +149,9 @@ impl Jobs {
         }
     }
 
-    /// Enqueues a failed or cancelled job again; it continues from its last checkpoint.
-    /// Errors: `Unknown`, `IllegalTransition`, what [`JobExecutor::check_again`] refuses, `QueueFull`, `Taken`, `Stopping`,
-    /// `Store`.
+    /// Enqueues a failed or cancelled job again, with its parts that failed or were cancelled; they continue from their last
+    /// checkpoints. Errors: `Unknown`, `IllegalTransition`, what [`JobExecutor::check_again`] refuses, `QueueFull`, `Taken`,
+    /// `Stopping`, `Store`.
     pub async fn resume(&self, id: JobId, by: &Author) -> Result<Job, JobError> {
         if self.shared.is_stopping() {
             return Err(JobError::Stopping);
@@ -174,7 +166,7 @@ impl Jobs {
         match self.shared.store.requeue(row.id, limit, by).await? {
             Some(EnqueueResult::New(row)) => {
                 self.shared.wake.notify_one();
-                Job::of(&row)
+                self.get(row.id).await
             }
             Some(other) => Err(self.refused(&other, &job.spec)),
             None => Err(illegal(id, JobState::Queued, JobTransition::Resume)),

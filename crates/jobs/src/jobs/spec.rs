@@ -4,7 +4,7 @@ mod import;
 mod train;
 
 use std::collections::BTreeMap;
-use std::ops::RangeInclusive;
+use std::ops::{Range, RangeInclusive};
 use std::path::Path;
 use std::str::FromStr;
 
@@ -16,12 +16,15 @@ pub use self::train::TrainSpec;
 use super::JobError;
 use crate::store::JobId;
 use foreframe_core::types::{DatasetName, ModelName, Seed, ValueError};
-use foreframe_data::dataset::{self, CollectConfig, CollectionStatus, DatasetError};
+use foreframe_data::dataset::{self, CollectConfig, CollectionStatus, DEFAULT_TRIALS_PER_SHARD, DatasetError};
 use foreframe_sim::{RoomSet, Scenario, SimError};
 use foreframe_train::evaluation::EvaluateConfig;
 
 /// The maximum number of trials of one collection.
 pub const MAX_TRIALS: u64 = 1_000_000;
+
+/// The maximum number of parts of one collection.
+pub const MAX_PARTS: usize = 64;
 
 /// The maximum number of windows of each test set of an evaluation.
 pub const MAX_WINDOWS: usize = 100_000;
@@ -66,6 +69,15 @@ pub struct CollectSpec {
     /// Whether the states hold the true pose instead of the odometry's.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub true_pose: bool,
+    /// In how many parts workers may collect it, 1 to 64: each takes its share of the trials, in shards of 50. The data set has
+    /// the same bytes however many there are.
+    #[serde(default = "default_parts", skip_serializing_if = "is_one")]
+    #[schema(minimum = 1, maximum = 64, default = 1)]
+    pub parts: usize,
+    /// Which of the parts this job collects, from 0. Only jobs that are parts have it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schema(read_only)]
+    pub part: Option<usize>,
 }
 
 /// An evaluation: writes a report with figures, which the job's files contain.
@@ -107,6 +119,15 @@ pub struct EvaluateSpec {
 
 fn default_seed() -> u64 {
     1
+}
+
+fn default_parts() -> usize {
+    1
+}
+
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde calls it with a reference")]
+fn is_one(parts: &usize) -> bool {
+    *parts == 1
 }
 
 fn default_windows() -> usize {
@@ -185,6 +206,16 @@ impl JobSpec {
         }
     }
 
+    /// Its parts, which any worker can do; none if it is done as a whole.
+    #[must_use]
+    pub fn parts(&self) -> Vec<Self> {
+        match self {
+            Self::Train(spec) => spec.parts().into_iter().map(Self::Train).collect(),
+            Self::Collect(spec) => spec.parts().into_iter().map(Self::Collect).collect(),
+            Self::Import(_) | Self::Evaluate(_) => Vec::new(),
+        }
+    }
+
     /// Checks everything that can be checked before the work starts. Errors: `Invalid` and `NotFound`, which name the field;
     /// `Taken`, `Dataset`.
     pub fn check(&self, available: AvailableInputs<'_>) -> Result<(), JobError> {
@@ -223,6 +254,11 @@ impl CollectSpec {
             );
             return Err(JobError::invalid("trials", reason));
         }
+        check_range("parts", self.parts, 1..=MAX_PARTS)?;
+        if self.part.is_some() {
+            let reason = "only the server makes parts; leave it out, and say how many with parts";
+            return Err(JobError::invalid("part", reason));
+        }
         let config = self.config(&available.data_dir.join("datasets"))?;
         let is_there = available.datasets.contains(&self.name);
         // With a shared object store, a data set that is complete only here was deleted elsewhere or not yet pushed.
@@ -244,6 +280,33 @@ impl CollectSpec {
             }
             Err(error) => Err(error.into()),
         }
+    }
+
+    /// The number of its shards.
+    fn shard_count(&self) -> usize {
+        let shards = self.trials.div_ceil(DEFAULT_TRIALS_PER_SHARD);
+        usize::try_from(shards).unwrap_or(usize::MAX)
+    }
+
+    /// The shards of the part with this index: consecutive ones, in equal shares.
+    pub(super) fn shards_of(&self, part: usize) -> Range<usize> {
+        let (shards, parts) = (self.shard_count(), self.parts.max(1));
+        let start = |part: usize| shards * part.min(parts) / parts;
+        start(part)..start(part + 1)
+    }
+
+    /// Its parts; none if it is collected as a whole. There are never more parts than shards.
+    fn parts(&self) -> Vec<Self> {
+        let parts = self.parts.min(self.shard_count());
+        if parts < 2 || self.part.is_some() {
+            return Vec::new();
+        }
+        let part = |part| Self {
+            parts,
+            part: Some(part),
+            ..self.clone()
+        };
+        (0..parts).map(part).collect()
     }
 
     /// The configuration of the collection, into a directory below `datasets`. Errors: `Invalid`, which names the scenarios.
@@ -334,6 +397,25 @@ mod tests {
         let text = r#"{"kind":"collect","name":"a","scenario":"crowded","trials":1,"colour":"red"}"#;
         let error = serde_json::from_str::<JobSpec>(text).unwrap_err().to_string();
         assert!(error.contains("unknown field `colour`"), "{error}");
+    }
+
+    #[test]
+    fn the_parts_of_a_collection_are_all_its_shards() {
+        let spec = |trials: u64, parts: usize| -> CollectSpec {
+            let spec = serde_json::json!({"name": "a", "scenario": "crowded", "trials": trials, "parts": parts});
+            serde_json::from_value(spec).unwrap()
+        };
+        for (trials, parts) in [(501, 3), (501, 11), (501, 64), (1_000_000, 64)] {
+            let made = spec(trials, parts).parts();
+            let shards: Vec<usize> = made
+                .iter()
+                .flat_map(|made| made.shards_of(made.part.unwrap()))
+                .collect();
+            assert_eq!(shards, (0..trials.div_ceil(50) as usize).collect::<Vec<_>>());
+            assert!(made.len() <= parts && made.iter().all(|made| !made.shards_of(made.part.unwrap()).is_empty()));
+        }
+        assert_eq!(spec(50, 8).parts(), []);
+        assert_eq!(spec(500, 1).parts(), []);
     }
 
     #[test]

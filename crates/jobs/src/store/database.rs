@@ -37,6 +37,7 @@ const MIGRATIONS: &[(i64, &str, &str)] = &[
         include_str!("migrations/0003_key_scopes_and_audit.sql"),
     ),
     (4, "after", include_str!("migrations/0004_after.sql")),
+    (5, "parts", include_str!("migrations/0005_parts.sql")),
 ];
 
 /// A parameter of a statement: `$1`, `$2`, …

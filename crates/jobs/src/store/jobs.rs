@@ -3,143 +3,36 @@
 //! A lease expires unless it is renewed. Each claim increments the row's fencing token, and every write names the token of
 //! its claim. So a worker whose lease expired cannot write any more.
 
-use serde::{Deserialize, Deserializer};
-
 use super::audit::Author;
 use super::database::{DatabaseRow, Tx, read_all, values};
 use super::job_id::JobId;
+use super::job_rows::{EnqueueResult, JobCount, JobOutcome, JobPage, JobRow, NewJob};
 use super::lease::Lease;
 use super::models::{PublishedVersion, version_id};
+use super::parts;
 use super::reports::{JobReport, write_report};
-use super::{ModelMetrics, Store, StoreError};
+use super::{Store, StoreError};
 
-/// The row of a job. Structured values are JSON.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
-pub struct JobRow {
-    /// The job's id.
-    #[serde(rename = "number", deserialize_with = "job_id")]
-    pub id: JobId,
-    /// `collect`, `train`, …
-    pub kind: String,
-    /// `queued`, `running`, `succeeded`, `failed` or `cancelled`.
-    pub state: String,
-    /// Its specification.
-    pub spec: String,
-    /// Its progress.
-    pub progress: String,
-    /// Its result.
-    pub outcome: Option<String>,
-    /// Why it failed.
-    pub error: Option<String>,
-    /// Whether it is running and was asked to stop.
-    #[serde(deserialize_with = "flag")]
-    pub cancelling: bool,
-    /// When it was enqueued, in seconds since 1970.
-    pub queued_s: f64,
-    /// When its first attempt started, in seconds since 1970.
-    pub started_s: Option<f64>,
-    /// When it ended, in seconds since 1970.
-    pub ended_s: Option<f64>,
-    /// How often it was claimed.
-    pub token: i64,
-    /// How many units of work are saved.
-    pub checkpoint: i64,
-    /// How many attempts in a row ended abnormally without saving more.
-    pub stalled_attempts: i64,
-    /// The id of the API key that submitted it; empty without a key.
-    pub submitter: String,
-}
-
-fn job_id<'de, D: Deserializer<'de>>(deserializer: D) -> Result<JobId, D::Error> {
-    i64::deserialize(deserializer).map(JobId::new)
-}
-
-fn flag<'de, D: Deserializer<'de>>(deserializer: D) -> Result<bool, D::Error> {
-    Ok(i64::deserialize(deserializer)? != 0)
-}
-
-/// A job to enqueue.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct NewJob {
-    /// `collect`, `train`, …
-    pub kind: String,
-    /// An output that only one queued or running job can have.
-    pub exclusive_output: Option<String>,
-    /// Its specification.
-    pub spec: String,
-    /// Its initial progress.
-    pub progress: String,
-    /// The caller's idempotency key: one key never makes two jobs.
-    pub idempotency_key: Option<String>,
-    /// The id of the caller's API key; empty without a key.
-    pub submitter: String,
-    /// The job that must end before this one starts.
-    pub after: Option<JobId>,
-}
-
-/// The result of enqueueing.
-#[derive(Clone, Debug, PartialEq)]
-pub enum EnqueueResult {
-    /// The job was enqueued.
-    New(JobRow),
-    /// A job with this idempotency key exists.
-    Same(JobRow),
-    /// The queue is full.
-    Full,
-    /// The submitter's share of the queue is full: the number of waiting jobs that one API key may have.
-    ShareFull(i64),
-    /// A queued or running job has the same output.
-    Taken,
-}
-
-/// How an attempt of a job ended.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct JobOutcome {
-    /// The state that follows.
-    pub state: &'static str,
-    /// Why it failed.
-    pub error: Option<String>,
-    /// Its result.
-    pub outcome: Option<String>,
-    /// When, in seconds since 1970; `None` if the job goes back to the queue.
-    pub ended_s: Option<f64>,
-    /// The published version.
-    pub published: Option<PublishedVersion>,
-    /// What an evaluation measured.
-    pub measured: Option<ModelMetrics>,
-    /// Whether the attempt ended abnormally.
-    pub crashed: bool,
-}
-
-/// How many jobs of a kind are in a state.
-#[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
-pub struct JobCount {
-    /// `collect`, `train`, …
-    pub kind: String,
-    /// `queued`, `running`, …
-    pub state: String,
-    /// The number of such jobs.
-    pub jobs: i64,
-}
-
-/// Which jobs to list, the newest first.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct JobPage {
-    /// Only of that kind.
-    pub kind: Option<String>,
-    /// Only in that state.
-    pub state: Option<String>,
-    /// Only those enqueued before that job.
-    pub before: Option<JobId>,
-    /// The maximum number of jobs.
-    pub limit: i64,
+/// All columns of jobs, with the number of their parts in each state.
+macro_rules! select_jobs {
+    ($condition:literal) => {
+        concat!(
+            "SELECT jobs.*, (SELECT COUNT(*) FROM jobs AS part WHERE part.parent = jobs.number) AS parts, \
+             (SELECT COUNT(*) FROM jobs AS part WHERE part.parent = jobs.number AND part.state = 'succeeded') AS parts_done, \
+             (SELECT COUNT(*) FROM jobs AS part WHERE part.parent = jobs.number AND part.state = 'running') AS parts_running, \
+             (SELECT COUNT(*) FROM jobs AS part WHERE part.parent = jobs.number \
+             AND part.state IN ('failed', 'cancelled')) AS parts_failed FROM jobs WHERE ",
+            $condition
+        )
+    };
 }
 
 fn id_of(row: &DatabaseRow) -> Result<JobId, StoreError> {
     row.get("number").map(JobId::new)
 }
 
-/// Checks that the queue and the submitter's share of it have room, and that no queued or running job has the same output.
+/// Checks that the queue and the submitter's share of it have room, and that no queued or running job has the same output. A job
+/// counts once, however many parts it has.
 async fn check_capacity(
     tx: &mut Tx,
     makes: Option<String>,
@@ -152,14 +45,14 @@ async fn check_capacity(
     if tx.first(sql, values![makes]).await?.is_some() {
         return Ok(Some(EnqueueResult::Taken));
     }
-    let sql = "SELECT number FROM jobs WHERE state = 'queued'";
+    let sql = "SELECT number FROM jobs WHERE state = 'queued' AND parent IS NULL";
     if tx.fetch(sql, values![]).await?.len() as i64 >= max_queued {
         return Ok(Some(EnqueueResult::Full));
     }
     if submitter.is_empty() {
         return Ok(None);
     }
-    let sql = "SELECT COUNT(*) AS keys, (SELECT COUNT(*) FROM jobs WHERE submitter = $1 AND state = 'queued') AS queued \
+    let sql = "SELECT COUNT(*) AS keys, (SELECT COUNT(*) FROM jobs WHERE submitter = $1 AND state = 'queued' AND parent IS NULL) AS queued \
          FROM api_keys WHERE revoked_s IS NULL AND scope <> 'predict' AND (expires_s IS NULL OR expires_s > $2)";
     let Some(row) = tx.first(sql, values![submitter, now_s]).await? else {
         return Ok(None);
@@ -171,7 +64,7 @@ async fn check_capacity(
 }
 
 impl Store {
-    /// Enqueues a job unless the queue is full. `now_s`: see [`Store::now_s`]. Errors: `Query`.
+    /// Enqueues a job with its parts unless the queue is full. `now_s`: see [`Store::now_s`]. Errors: `Query`.
     pub async fn enqueue(&self, new: NewJob, max_queued: i64, now_s: f64) -> Result<EnqueueResult, StoreError> {
         let mut tx = self.database.begin().await?;
         tx.lock_numbers().await?;
@@ -203,12 +96,13 @@ impl Store {
         ];
         let row = tx.first(sql, values).await?;
         let row: JobRow = row.ok_or(StoreError::Query(sqlx::Error::RowNotFound))?.read()?;
+        parts::enqueue(&mut tx, row.id, new.parts).await?;
         let change = Author::of_key(&row.submitter).change("job.create", row.id);
         change.commit(tx).await?;
         Ok(EnqueueResult::New(row))
     }
 
-    /// Enqueues a failed or cancelled job again; `None` if it is neither. Errors: `Query`.
+    /// Enqueues a failed or cancelled job again, with those of its parts that failed or were cancelled; `None` if it is neither. Errors: `Query`.
     pub async fn requeue(&self, id: JobId, max_queued: i64, by: &Author) -> Result<Option<EnqueueResult>, StoreError> {
         let now_s = self.database.now_s().await?;
         let mut tx = self.database.begin().await?;
@@ -224,39 +118,58 @@ impl Store {
         let sql = "UPDATE jobs SET state = 'queued', error = NULL, ended_s = NULL, cancelling = 0, owner = NULL, \
              stalled_attempts = 0, lease_until_s = NULL WHERE number = $1 RETURNING *";
         let row = tx.first(sql, values![id]).await?.map(DatabaseRow::read).transpose()?;
+        parts::requeue(&mut tx, id).await?;
         by.change("job.resume", id).commit(tx).await?;
         Ok(row.map(EnqueueResult::New))
     }
 
-    /// Deletes all ended jobs except the latest `keep`; returns their ids. Errors: `Query`.
+    /// Deletes all ended jobs except the latest `keep`, with their parts; returns the ids of all. Errors: `Query`.
     pub async fn forget_ended(&self, keep: i64) -> Result<Vec<JobId>, StoreError> {
         // Both conditions check the state, because a job can be resumed between them.
-        let sql = "DELETE FROM jobs WHERE state IN ('succeeded', 'failed', 'cancelled') AND number IN (SELECT number \
-             FROM jobs WHERE state IN ('succeeded', 'failed', 'cancelled') ORDER BY ended_s DESC, number DESC \
-             LIMIT 1000000 OFFSET $1) RETURNING number";
+        let sql = "WITH old AS (SELECT number FROM jobs WHERE state IN ('succeeded', 'failed', 'cancelled') \
+             AND parent IS NULL ORDER BY ended_s DESC, number DESC LIMIT 1000000 OFFSET $1), \
+             busy AS (SELECT parent FROM jobs WHERE parent IS NOT NULL AND state IN ('queued', 'running')) \
+             DELETE FROM jobs WHERE state IN ('succeeded', 'failed', 'cancelled') \
+             AND (number IN (SELECT number FROM old) OR parent IN (SELECT number FROM old)) \
+             AND COALESCE(parent, number) NOT IN (SELECT parent FROM busy) RETURNING number";
         let rows = self.database.fetch(sql, values![keep]).await?;
         rows.iter().map(id_of).collect()
     }
 
     /// One job. Errors: `Query`.
     pub async fn job(&self, id: JobId) -> Result<Option<JobRow>, StoreError> {
-        let sql = "SELECT * FROM jobs WHERE number = $1";
+        let sql = select_jobs!("number = $1");
         self.database.read_first(sql, values![id]).await
     }
 
     /// The job that was enqueued with that idempotency key. Errors: `Query`.
     pub async fn job_of_key(&self, key: &str) -> Result<Option<JobRow>, StoreError> {
-        let sql = "SELECT * FROM jobs WHERE idempotency_key = $1";
+        let sql = select_jobs!("idempotency_key = $1");
         self.database.read_first(sql, values![key]).await
     }
 
     /// Jobs, the newest first. Errors: `Query`.
     pub async fn jobs(&self, page: JobPage) -> Result<Vec<JobRow>, StoreError> {
-        let sql = "SELECT * FROM jobs WHERE (CAST($1 AS TEXT) IS NULL OR kind = $1) \
+        let sql = select_jobs!(
+            "(CAST($1 AS TEXT) IS NULL OR kind = $1) \
              AND (CAST($2 AS TEXT) IS NULL OR state = $2) AND (CAST($3 AS BIGINT) IS NULL OR number < $3) \
-             ORDER BY number DESC LIMIT $4";
-        let values = values![page.kind, page.state, page.before.map(JobId::number), page.limit];
+             AND (parent = $5 OR (CAST($5 AS BIGINT) IS NULL AND parent IS NULL)) ORDER BY number DESC LIMIT $4"
+        );
+        let (before, part_of) = (page.before.map(JobId::number), page.part_of.map(JobId::number));
+        let values = values![page.kind, page.state, before, page.limit, part_of];
         read_all(self.database.fetch(sql, values).await?)
+    }
+
+    /// The parts of a job, in their order. Errors: `Query`.
+    pub async fn parts(&self, of: JobId) -> Result<Vec<JobRow>, StoreError> {
+        let sql = "SELECT * FROM jobs WHERE parent = $1 ORDER BY number";
+        read_all(self.database.fetch(sql, values![of]).await?)
+    }
+
+    /// All queued and running jobs and parts. Errors: `Query`.
+    pub async fn open_jobs(&self) -> Result<Vec<JobRow>, StoreError> {
+        let sql = "SELECT * FROM jobs WHERE state IN ('queued', 'running') ORDER BY number";
+        read_all(self.database.fetch(sql, values![]).await?)
     }
 
     /// The number of jobs of each kind and state, without zeros. Errors: `Query`.
@@ -265,8 +178,9 @@ impl Store {
         read_all(self.database.fetch(sql, values![]).await?)
     }
 
-    /// Claims a job that is queued, and does not wait for another, or whose lease has expired, by the database's clock, for `lease_s` seconds. It is the oldest
-    /// job of the submitter with the fewest running jobs; of several, of the one whose last job was claimed longest ago.
+    /// Claims a job that is queued, and waits neither for another nor for its parts, or whose lease has expired, by the
+    /// database's clock, for `lease_s` seconds. It is the oldest job of the submitter with the fewest running jobs; of several,
+    /// of the one whose last job was claimed longest ago.
     /// Errors: `Query`.
     pub async fn claim(&self, owner: &str, lease_s: f64) -> Result<Option<(JobRow, Lease)>, StoreError> {
         let now_s = self.database.now_s().await?;
@@ -277,7 +191,9 @@ impl Store {
     pub async fn claim_at(&self, owner: &str, now_s: f64, until_s: f64) -> Result<Option<(JobRow, Lease)>, StoreError> {
         let mut tx = self.database.begin().await?;
         let sql = "SELECT number FROM jobs WHERE (state = 'queued' AND NOT EXISTS (SELECT 1 FROM jobs AS earlier \
-             WHERE earlier.number = jobs.after_job AND earlier.state IN ('queued', 'running'))) \
+             WHERE earlier.number = jobs.after_job AND earlier.state IN ('queued', 'running')) \
+             AND NOT EXISTS (SELECT 1 FROM jobs AS part \
+             WHERE part.parent = jobs.number AND part.state IN ('queued', 'running'))) \
              OR (state = 'running' AND lease_until_s < $1) ORDER BY \
              (SELECT COUNT(*) FROM jobs AS other WHERE other.submitter = jobs.submitter \
              AND other.state = 'running' AND other.lease_until_s >= $1), \
@@ -346,7 +262,7 @@ impl Store {
              checkpoint = CASE WHEN $8 > checkpoint THEN $8 ELSE checkpoint END, \
              stalled_attempts = CASE WHEN claimed_checkpoint < 0 THEN stalled_attempts \
              WHEN $8 > claimed_checkpoint OR checkpoint > claimed_checkpoint THEN 0 ELSE stalled_attempts + $9 END, \
-             owner = NULL, lease_until_s = NULL WHERE number = $1 AND token = $2 AND state = 'running' RETURNING submitter";
+             owner = NULL, lease_until_s = NULL WHERE number = $1 AND token = $2 AND state = 'running' RETURNING submitter, parent";
         let values = values![
             lease.job,
             lease.token,
@@ -370,18 +286,32 @@ impl Store {
             tx.commit().await?;
             return Ok(true);
         };
-        super::models::write_published(&mut tx, &published, now_s).await?;
+        // Which version of a sweep becomes active is known when all its parts have ended.
+        let published = PublishedVersion {
+            activates: published.activates && row.get::<Option<i64>>("parent")?.is_none(),
+            ..published
+        };
+        let is_new = super::models::write_published(&mut tx, &published, now_s).await?;
+        if !is_new {
+            tx.commit().await?;
+            return Ok(true);
+        }
         let by = Author::of_key(&row.get::<String>("submitter")?);
         let change = by.change("version.publish", version_id(&published.model, published.version));
         change.commit(tx).await?;
         Ok(true)
     }
 
-    /// Cancels a queued job. Returns whether it was queued. Errors: `Query`.
+    /// Cancels a queued job with its parts. Returns whether it was queued. Errors: `Query`.
     pub async fn cancel_queued(&self, id: JobId, now_s: f64, by: &Author) -> Result<bool, StoreError> {
+        let mut tx = self.database.begin().await?;
         let sql = "UPDATE jobs SET state = 'cancelled', ended_s = $2 WHERE number = $1 AND state = 'queued'";
-        let change = by.change("job.cancel", id);
-        self.execute_recorded(sql, values![id, now_s], change).await
+        if tx.execute(sql, values![id, now_s]).await? == 0 {
+            return Ok(false);
+        }
+        parts::cancel(&mut tx, id, now_s).await?;
+        by.change("job.cancel", id).commit(tx).await?;
+        Ok(true)
     }
 
     /// Asks a running job to stop, if it was not asked before. Returns whether it is running. Errors: `Query`.

@@ -171,15 +171,16 @@ pub(super) fn version_id(model: &ModelName, version: u32) -> String {
     format!("{model}@{version}")
 }
 
-pub(super) async fn write_published(tx: &mut Tx, published: &PublishedVersion, now_s: f64) -> Result<(), StoreError> {
-    let sql = "UPDATE model_versions SET published_s = $3 WHERE model = $1 AND version = $2";
+/// Publishes a version, and makes it active if it activates and none is. Returns whether it was not published before.
+pub(super) async fn write_published(tx: &mut Tx, published: &PublishedVersion, now_s: f64) -> Result<bool, StoreError> {
+    let sql = "UPDATE model_versions SET published_s = $3 WHERE model = $1 AND version = $2 AND published_s IS NULL";
     let values = values![&published.model, published.version, now_s];
-    tx.execute(sql, values.clone()).await?;
+    let is_new = tx.execute(sql, values.clone()).await? > 0;
     if published.activates {
         let sql = "INSERT INTO active_versions (model, version, since_s) VALUES ($1, $2, $3) ON CONFLICT DO NOTHING";
         tx.execute(sql, values).await?;
     }
-    Ok(())
+    Ok(is_new)
 }
 
 /// Replaces the metrics of a version.

@@ -281,6 +281,7 @@ pub struct SetScores {
     pub plans: Option<PlanOutcome>,
     /// Where movers are, and how far away things are. Absent for a model that does not tell.
     #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[doc(hidden)]
     pub surroundings: Option<SurroundingsScores>,
     /// How well the expected errors fit. Absent for a model without calibration.
     #[serde(default)]

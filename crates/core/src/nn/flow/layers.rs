@@ -126,12 +126,8 @@ fn layer_sizes(spec: &ModelSpec, flow: &FlowSpec) -> Vec<LayerSize> {
     }
     if sizes.depth {
         layer("depth.enlarge", channels, 4 * sizes.enlarged_channels, quarter);
-        layer(
-            "depth.output",
-            TAPS * (sizes.enlarged_channels + sizes.stem_channels),
-            4,
-            half,
-        );
+        let read = TAPS * (sizes.enlarged_channels + sizes.stem_channels);
+        layer("depth.output", read, 4, half);
     }
     if sizes.movers {
         layer("movers.seen", channels, FRAME_CHANNELS, quarter);

@@ -47,6 +47,24 @@ pub(crate) fn count(out: &Path, shards: Range<usize>) -> usize {
     saved.map(|records| records.len()).sum()
 }
 
+/// The files of the saved trials in a directory. Errors: `Io`.
+pub(crate) fn files(out: &Path) -> Result<Vec<PathBuf>, DatasetError> {
+    let dir = out.join(DIRECTORY);
+    let entries = match fs::read_dir(&dir) {
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(Vec::new()),
+        entries => entries.map_err(DatasetError::io("read", &dir))?,
+    };
+    let paths = entries.filter_map(|entry| Some(entry.ok()?.path()));
+    Ok(paths
+        .filter(|path| path.extension().is_some_and(|extension| extension == "parquet"))
+        .collect())
+}
+
+/// The place of such a file in another directory.
+pub(crate) fn moved(file: &Path, out: &Path) -> PathBuf {
+    out.join(DIRECTORY).join(file.file_name().unwrap_or_default())
+}
+
 /// Deletes the saved trials of all shards, after every shard is complete. Errors: `Io`.
 pub(crate) fn remove_all(out: &Path) -> Result<(), DatasetError> {
     let dir = out.join(DIRECTORY);

@@ -10,9 +10,11 @@ use crate::jobs::JobError;
 use crate::store::JobId;
 use foreframe_core::error_text;
 use foreframe_core::types::{DatasetName, ModelName};
-use foreframe_train::training::{TrainConfig, TrainError};
+use foreframe_train::training::sweep::set_nested;
+use foreframe_train::training::{Sweep, TrainConfig, TrainError};
 
-/// A training: publishes the next version of the model `name`. A cancelled training resumes from its checkpoint.
+/// A training: publishes the next version of the model `name`. A cancelled training resumes from its checkpoint. With `sweep`, it
+/// has one part for each combination of the values, and each part publishes a version.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct TrainSpec {
@@ -36,6 +38,11 @@ pub struct TrainSpec {
     #[serde(default, skip_serializing_if = "serde_json::Map::is_empty")]
     #[schema(value_type = Object)]
     pub settings: serde_json::Map<String, serde_json::Value>,
+    /// Settings with dotted keys, each with the values that it takes in turn: `{"seed": [1, 2, 3], "model.hidden": [64, 128]}` is
+    /// 6 trainings. At most 64. The result lists them, the lowest validation error first.
+    #[serde(default, skip_serializing_if = "Sweep::is_empty")]
+    #[schema(value_type = BTreeMap<String, Vec<serde_json::Value>>)]
+    pub sweep: Sweep,
     /// Waits until the job with this id has ended, and fails if that has failed. The data set or model that it makes need not
     /// exist yet.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -54,7 +61,12 @@ fn preset_schema() -> utoipa::openapi::Object {
 
 impl TrainSpec {
     pub(super) fn check(&self, datasets: &[DatasetName]) -> Result<(), JobError> {
+        let sweep = self.sweep.check();
+        sweep.map_err(|error| JobError::invalid("sweep", error.to_string()))?;
         self.config()?;
+        for part in self.parts() {
+            part.config()?;
+        }
         check_dataset(&self.dataset, datasets)?;
         for (name, weight) in &self.mixture {
             check_known(("mixture", "data set"), name, datasets.iter())?;
@@ -73,6 +85,27 @@ impl TrainSpec {
     /// All data sets with their weights.
     pub(in crate::jobs) fn datasets(&self) -> impl Iterator<Item = (&DatasetName, f64)> {
         iter::once((&self.dataset, 1.0)).chain(self.mixture.iter().map(|(name, weight)| (name, *weight)))
+    }
+
+    /// The trainings of a sweep; none without one.
+    pub(in crate::jobs) fn parts(&self) -> Vec<Self> {
+        let points = if self.sweep.is_empty() {
+            Vec::new()
+        } else {
+            self.sweep.points()
+        };
+        let parts = points.into_iter().map(|point| {
+            let mut settings = self.settings.clone();
+            for (key, value) in point {
+                set_nested(&mut settings, &key, value);
+            }
+            Self {
+                settings,
+                sweep: Sweep::default(),
+                ..self.clone()
+            }
+        });
+        parts.collect()
     }
 
     /// The preset with the job's settings. Errors: `Invalid`, which names the presets or the setting.
@@ -105,10 +138,30 @@ mod tests {
             dataset: "d".parse().unwrap(),
             mixture: BTreeMap::new(),
             settings: serde_json::Map::new(),
+            sweep: Sweep::default(),
             after: None,
         };
         let error = spec.check(&[]).unwrap_err().to_string();
         assert!(error.starts_with("preset: ") && error.contains("moving"), "{error}");
+    }
+
+    #[test]
+    fn a_sweep_is_a_training_for_each_combination() {
+        let spec = |sweep: serde_json::Value| -> TrainSpec {
+            let settings = serde_json::json!({"model": {"hidden": 8}, "seed": 9});
+            let spec = serde_json::json!({"name": "m", "preset": "paper", "dataset": "a", "settings": settings, "sweep": sweep});
+            serde_json::from_value(spec).unwrap()
+        };
+        let swept = spec(serde_json::json!({"seed": [1, 2], "model.features": [4, 8]}));
+        let known = ["a".parse().unwrap()];
+        swept.check(&known).unwrap();
+        let parts = swept.parts();
+        let expected = serde_json::json!({"model": {"hidden": 8, "features": 4}, "seed": 2});
+        assert_eq!(serde_json::Value::Object(parts[1].settings.clone()), expected);
+        assert_eq!((parts.len(), parts[1].config().unwrap().seed.0), (4, 2));
+        let refused = |sweep| spec(sweep).check(&known).unwrap_err().to_string();
+        assert!(refused(serde_json::json!({"seed": []})).starts_with("sweep: \"seed\" has no values"));
+        assert!(refused(serde_json::json!({"model.hiden": [1]})).contains("hiden"));
     }
 
     #[test]
@@ -124,6 +177,7 @@ mod tests {
                     .map(|&(name, weight)| (name.parse().unwrap(), weight))
                     .collect(),
                 settings: serde_json::Map::new(),
+                sweep: Sweep::default(),
                 after: None,
             };
             spec.check(&known).map_err(|error| error.to_string())
