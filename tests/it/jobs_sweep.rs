@@ -124,6 +124,6 @@ fn train_sweeps_on_the_command_line_and_continues() {
     );
     let best = lines[3].trim_start_matches("next: foreframe ");
     assert_eq!(run(&command), table);
-    assert!(run(&format!("{command},3")).lines().count() >= 4);
+    assert_eq!(run(&format!("{command},3")).lines().count(), 5);
     assert!(run(best).starts_with("published paper@"));
 }

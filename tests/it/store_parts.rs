@@ -91,6 +91,9 @@ async fn a_cancelled_job_cancels_its_parts() {
         // Its files are in use until the part that ran has stopped.
         assert_eq!(store.forget_ended(0).await.unwrap(), []);
         assert_eq!(store.open_jobs().await.unwrap().len(), 1);
+        // Resumed now, that part would stay cancelled.
+        let resumed = store.requeue(PARENT, 9, &Author::CommandLine).await.unwrap();
+        assert!(matches!(resumed, Some(EnqueueResult::PartsStopping)), "{resumed:?}");
         assert!(
             store
                 .end(lease, outcome("cancelled"), JobReport::default())

@@ -53,6 +53,9 @@ pub enum JobError {
         /// The requested transition.
         event: JobTransition,
     },
+    /// Parts of a cancelled job still run.
+    #[error("parts of job {0} have not stopped yet; resume it when they have")]
+    PartsStopping(JobId),
     /// The queue is full: so many jobs are waiting.
     #[error("the job queue is full ({0} jobs are waiting); cancel one or try again later")]
     QueueFull(usize),
@@ -129,7 +132,9 @@ impl HasErrorKind for JobError {
         match self {
             Self::Unknown(_) => ErrorKind::NotFound,
             Self::Invalid { .. } | Self::NotFound { .. } => ErrorKind::Usage,
-            Self::IllegalTransition { .. } | Self::Taken { .. } | Self::InUse { .. } => ErrorKind::Conflict,
+            Self::IllegalTransition { .. } | Self::PartsStopping(_) | Self::Taken { .. } | Self::InUse { .. } => {
+                ErrorKind::Conflict
+            }
             Self::QueueFull(_) | Self::ShareFull(_) | Self::Stopping => ErrorKind::Busy,
             Self::Dataset(error) => error.kind().of_own_data(),
             Self::Versions(error) => error.kind().of_own_data(),

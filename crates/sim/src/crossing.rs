@@ -1,6 +1,7 @@
 //! Robots that drive to and fro across the way ahead of Tb1, for the scenario `crossing`.
 
 use std::f32::consts::TAU;
+use std::ops::Range;
 
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
@@ -22,6 +23,8 @@ const NEAREST_M: f32 = 0.8;
 const SIDES_M: [f32; 5] = [1.6, 1.3, 1.0, 0.7, 0.5];
 /// Greatest angle between a robot's way and the direction across, in radians.
 const SLANT_RAD: f32 = 0.5;
+/// Highest speed of a robot. One that is as fast as Tb1 comes from 45° aside when they collide, where most cameras do not look.
+const SPEED_M_S: Range<f32> = 0.15..0.4;
 /// Two robots start at least this far apart, in metres.
 const APART_M: f32 = 0.5;
 const TRIES: usize = 60;
@@ -128,7 +131,10 @@ pub(super) fn draw_route(
                 heading_rad,
             },
             goal_m: goal,
-            gains: PidGains::draw(random),
+            gains: PidGains {
+                max_linear_m_s: random.random_range(SPEED_M_S),
+                ..PidGains::draw(random)
+            },
             crossing: Some(CrossingHabits {
                 reacts: random.random_bool(0.5),
                 halts: random.random_bool(0.3),

@@ -37,8 +37,10 @@ class RerunLog:
         if at in self._due:
             predicted, expected = self._due.pop(at)
             self._log(PREDICTED, rerun.Image(predicted))
-            difference = (predicted.astype(np.float64) - frame) / 255
-            self._log(ERROR, rerun.Scalars(float(np.mean(difference**2))))
+            # A frame that the server resized cannot be compared with the prediction.
+            if predicted.shape == np.shape(frame):
+                difference = (predicted.astype(np.float64) - frame) / 255
+                self._log(ERROR, rerun.Scalars(float(np.mean(difference**2))))
             if expected is not None:
                 self._log(EXPECTED_ERROR, rerun.Scalars(expected))
         prediction = answer.prediction

@@ -48,6 +48,9 @@ impl JobMemory {
 
     /// What a training will need, without starting it. Errors: `Invalid`, `NotFound`, and those of reading the data sets.
     pub async fn estimate(self, spec: &TrainSpec, objects: &Objects) -> Result<TrainingEstimate, JobError> {
+        spec.sweep
+            .check()
+            .map_err(|error| JobError::invalid("sweep", error.to_string()))?;
         let mut dataset = datasets::describe(objects, &spec.dataset).await?;
         for name in spec.mixture.keys() {
             dataset.frame_count += datasets::describe(objects, name).await?.frame_count;

@@ -168,6 +168,7 @@ impl Jobs {
                 self.shared.wake.notify_one();
                 self.get(row.id).await
             }
+            Some(EnqueueResult::PartsStopping) => Err(JobError::PartsStopping(id)),
             Some(other) => Err(self.refused(&other, &job.spec)),
             None => Err(illegal(id, JobState::Queued, JobTransition::Resume)),
         }

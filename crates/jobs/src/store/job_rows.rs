@@ -90,6 +90,8 @@ pub enum EnqueueResult {
     ShareFull(i64),
     /// A queued or running job has the same output.
     Taken,
+    /// Parts of the job that were cancelled have not stopped yet.
+    PartsStopping,
 }
 
 /// How an attempt of a job ended.

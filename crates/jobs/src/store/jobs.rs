@@ -111,6 +111,9 @@ impl Store {
         let Some(row) = tx.first(sql, values![id]).await? else {
             return Ok(None);
         };
+        if parts::are_stopping(&mut tx, id).await? {
+            return Ok(Some(EnqueueResult::PartsStopping));
+        }
         let submitter: String = row.get("submitter")?;
         if let Some(refused) = check_capacity(&mut tx, row.get("makes")?, &submitter, max_queued, now_s).await? {
             return Ok(Some(refused));
@@ -125,15 +128,19 @@ impl Store {
 
     /// Deletes all ended jobs except the latest `keep`, with their parts; returns the ids of all. Errors: `Query`.
     pub async fn forget_ended(&self, keep: i64) -> Result<Vec<JobId>, StoreError> {
-        // Both conditions check the state, because a job can be resumed between them.
+        let mut tx = self.database.begin().await?;
+        // No job is resumed meanwhile.
+        tx.lock_numbers().await?;
         let sql = "WITH old AS (SELECT number FROM jobs WHERE state IN ('succeeded', 'failed', 'cancelled') \
              AND parent IS NULL ORDER BY ended_s DESC, number DESC LIMIT 1000000 OFFSET $1), \
              busy AS (SELECT parent FROM jobs WHERE parent IS NOT NULL AND state IN ('queued', 'running')) \
              DELETE FROM jobs WHERE state IN ('succeeded', 'failed', 'cancelled') \
              AND (number IN (SELECT number FROM old) OR parent IN (SELECT number FROM old)) \
              AND COALESCE(parent, number) NOT IN (SELECT parent FROM busy) RETURNING number";
-        let rows = self.database.fetch(sql, values![keep]).await?;
-        rows.iter().map(id_of).collect()
+        let rows = tx.fetch(sql, values![keep]).await?;
+        let forgotten = rows.iter().map(id_of).collect::<Result<_, _>>()?;
+        tx.commit().await?;
+        Ok(forgotten)
     }
 
     /// One job. Errors: `Query`.

@@ -177,7 +177,9 @@ pub(super) async fn write_published(tx: &mut Tx, published: &PublishedVersion, n
     let values = values![&published.model, published.version, now_s];
     let is_new = tx.execute(sql, values.clone()).await? > 0;
     if published.activates {
-        let sql = "INSERT INTO active_versions (model, version, since_s) VALUES ($1, $2, $3) ON CONFLICT DO NOTHING";
+        // A sweep activates a version that was published before, and may have been deleted since.
+        let sql = "INSERT INTO active_versions (model, version, since_s) SELECT model, version, $3 FROM model_versions \
+             WHERE model = $1 AND version = $2 AND deleted_s IS NULL ON CONFLICT DO NOTHING";
         tx.execute(sql, values).await?;
     }
     Ok(is_new)

@@ -46,6 +46,13 @@ pub(super) async fn cancel(tx: &mut Tx, parent: JobId, now_s: f64) -> Result<(),
     tx.execute(sql, values![parent, now_s]).await.map(drop)
 }
 
+/// Whether parts of a job that was cancelled have not stopped yet. Errors: `Query`.
+pub(super) async fn are_stopping(tx: &mut Tx, parent: JobId) -> Result<bool, StoreError> {
+    let sql =
+        "SELECT number FROM jobs WHERE parent = $1 AND (state = 'running' OR (state = 'queued' AND cancelling = 1))";
+    Ok(tx.first(sql, values![parent]).await?.is_some())
+}
+
 /// Enqueues the failed and cancelled parts of a job again. Errors: `Query`.
 pub(super) async fn requeue(tx: &mut Tx, parent: JobId) -> Result<(), StoreError> {
     let sql = "UPDATE jobs SET state = 'queued', error = NULL, ended_s = NULL, cancelling = 0, owner = NULL, \

@@ -8,7 +8,8 @@ use super::metrics::StepCurve;
 use super::progress::{EvaluationContext, EvaluationStage};
 use super::replay::replayed;
 use super::windows::evenly;
-use foreframe_data::dataset::Window;
+use foreframe_core::nn::ModelSpec;
+use foreframe_data::dataset::{DatasetInfo, Window};
 
 /// Contexts at most whose depth is compared, evenly spread over the windows.
 const MAX_DEPTH_CONTEXTS: usize = 60;
@@ -114,7 +115,7 @@ fn movers(evaluation: &EvaluationContext, windows: &[Window]) -> Result<Option<M
     let (inference, spec) = (evaluation.inference, evaluation.inference.spec());
     let dataset = inference.dataset;
     let (info, pixels) = (dataset.info(), spec.pixels());
-    if !info.has_masks || info.frame_pixels() != pixels {
+    if !info.has_masks || !has_size_of(info, spec) {
         return Ok(None);
     }
     let mut counts = vec![MaskCounts::default(); 1 + spec.horizon];
@@ -148,6 +149,11 @@ fn movers(evaluation: &EvaluationContext, windows: &[Window]) -> Result<Option<M
     }))
 }
 
+/// Whether frames need no resizing, which masks and depths do not get.
+fn has_size_of(info: &DatasetInfo, spec: &ModelSpec) -> bool {
+    (info.frame_width_px, info.frame_height_px) == (spec.frame_width_px, spec.frame_height_px)
+}
+
 /// For each robot's id, whether a mask shows it.
 fn visible(mask: &[u8]) -> [bool; 256] {
     let mut pixels = [0; 256];
@@ -160,7 +166,7 @@ fn visible(mask: &[u8]) -> [bool; 256] {
 fn depth(evaluation: &EvaluationContext, windows: &[Window]) -> Result<Option<DepthScores>, EvaluationError> {
     let inference = evaluation.inference;
     let (dataset, spec) = (inference.dataset, inference.spec());
-    let is_same_size = dataset.info().frame_pixels() == spec.pixels();
+    let is_same_size = has_size_of(dataset.info(), spec);
     let Some(world) = dataset.info().world.as_ref().filter(|_| is_same_size) else {
         return Ok(None);
     };

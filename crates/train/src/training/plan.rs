@@ -2,7 +2,7 @@
 
 use super::augment::Augmentation;
 use super::batches::FrameSource;
-use super::config::{TrainConfig, WindowBudget};
+use super::config::{Mirror, TrainConfig, WindowBudget};
 use super::state::TrainState;
 use super::{START_KEY, TrainError, Training};
 use foreframe_core::nn::ModelSpec;
@@ -207,6 +207,12 @@ fn check_movers(config: &TrainConfig, dataset: &Dataset, spec: &ModelSpec) -> Re
         return Ok(());
     }
     let refused = |reason: String| Err(TrainError::Config(reason));
+    if config.data.mirror == Mirror::Movers {
+        return refused(
+            "data.mirror is \"movers\", which model.flow.movers does not fit; set one of them to off or false"
+                .to_owned(),
+        );
+    }
     if !dataset.info().has_masks {
         return refused(format!(
             "data set \"{}\" has no masks of movers, but model.flow.movers is true; collected data sets have them; set \

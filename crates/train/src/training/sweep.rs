@@ -10,6 +10,10 @@ use super::TrainError;
 /// The maximum number of trainings of a sweep.
 pub const MAX_SWEEP_POINTS: usize = 64;
 
+/// The longest key, in bytes, and the most groups that it names.
+const MAX_KEY_BYTES: usize = 100;
+const MAX_KEY_GROUPS: usize = 4;
+
 /// Settings with dotted keys, each with the values that it takes in turn.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(transparent)]
@@ -40,10 +44,23 @@ impl Sweep {
         self.0.is_empty()
     }
 
-    /// Checks that each setting has values, none of them twice, and that there are not too many trainings. Errors: `Config`.
+    /// Checks that keys are short, that each setting has values, none of them twice, and that there are not too many trainings.
+    /// Errors: `Config`.
     pub fn check(&self) -> Result<(), TrainError> {
+        let too_many = |points: usize| {
+            Err(refused(format!(
+                "{points} trainings are too many; a sweep has at most {MAX_SWEEP_POINTS}"
+            )))
+        };
         let mut points = 1_usize;
         for (key, values) in &self.0 {
+            if key.len() > MAX_KEY_BYTES || key.matches('.').count() > MAX_KEY_GROUPS {
+                let start: String = key.chars().take(20).collect();
+                return Err(refused(format!("\"{start}…\" is no setting that can be swept")));
+            }
+            if values.len() > MAX_SWEEP_POINTS {
+                return too_many(values.len());
+            }
             if values.is_empty() {
                 return Err(refused(format!("\"{key}\" has no values; give at least one")));
             }
@@ -53,9 +70,7 @@ impl Sweep {
             points = points.saturating_mul(values.len());
         }
         if points > MAX_SWEEP_POINTS {
-            return Err(refused(format!(
-                "{points} trainings are too many; a sweep has at most {MAX_SWEEP_POINTS}"
-            )));
+            return too_many(points);
         }
         Ok(())
     }
@@ -142,6 +157,11 @@ mod tests {
         assert!(refused(&["seed=1,1"]).contains("has the value 1 twice"));
         assert!(refused(&["seed=a..b"]).contains("is no range"));
         assert!(refused(&["seed=1", "seed=2"]).contains("is swept twice"));
+        let deep = format!("{}=1", vec!["a"; 6].join("."));
+        assert!(refused(&[&deep]).contains("is no setting that can be swept"));
+        let doubled: Vec<String> = (0..30).map(|at| format!("key{at}=1,2")).collect();
+        let doubled: Vec<&str> = doubled.iter().map(String::as_str).collect();
+        assert!(refused(&doubled).contains("1073741824 trainings are too many"));
     }
 
     #[test]

@@ -88,10 +88,10 @@ impl FlowNetwork {
         Ok(with_values(&logits, |logits| {
             let motions = std::iter::once([0.0; 3]).chain(motions.as_chunks::<3>().0.iter().copied());
             let frames = logits.chunks_exact(size.pixels());
-            let movers = frames
-                .clone()
-                .zip(motions)
-                .map(|(logits, motion)| view.movers(logits, motion));
+            let movers = frames.zip(motions).enumerate().map(|(step, (logits, motion))| {
+                let depths = (step == 0).then_some(known.depths_m.as_slice());
+                view.movers(logits, motion, depths)
+            });
             Occupancy {
                 movers: movers.collect(),
                 points: view.points(&known.depths_m, logits.get(..size.pixels())),

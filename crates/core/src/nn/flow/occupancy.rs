@@ -9,6 +9,8 @@ use crate::nn::ops::sampling::ImageSize;
 pub(super) const MOVER_PROBABILITY: f32 = 0.5;
 /// Pixels of a column, one above the other, that make a mover. One alone is more often an error.
 const LEAST_PIXELS: usize = 2;
+/// A mover whose feet are below the picture stands at this share of the distance at which the camera sees the floor, if no depth tells.
+const CUT_OFF_SHARE: f32 = 0.6;
 /// Columns to each side whose mover counts as the same.
 const COLUMNS_BESIDE: usize = 2;
 /// How far a mover reaches away from the camera behind its nearest side, in metres.
@@ -38,22 +40,40 @@ pub(super) struct OccupancyView {
 }
 
 impl OccupancyView {
-    /// The points of all pixels with these depths that do not belong to a mover. `movers`: the pixels' logits.
+    /// The points of all pixels with these depths that do not belong to a mover whose place is known. `movers`: the pixels' logits.
     pub(super) fn points(&self, depths: &[f32], movers: Option<&[f32]>) -> Vec<[f32; 3]> {
-        let is_fixed = |pixel: usize| movers.is_none_or(|logits| !self.is_beside_mover(logits, pixel));
-        let rays = self.viewer.rays().into_iter().zip(depths).enumerate();
-        rays.filter(|&(pixel, _)| is_fixed(pixel))
+        let rays = self.viewer.rays();
+        let has_place: Vec<bool> = match movers {
+            Some(logits) => (0..self.size.width)
+                .map(|column| self.nearest(&rays, logits, column, None).is_some())
+                .collect(),
+            None => vec![false; self.size.width],
+        };
+        let is_mover = |row: usize, column: usize| {
+            has_place[column]
+                && movers.is_some_and(|logits| probability(logits[row * self.size.width + column]) >= MOVER_PROBABILITY)
+        };
+        // Depths at the edge of a mover are between those of both sides.
+        let is_beside_mover = |pixel: usize| {
+            let (row, column) = (pixel / self.size.width, pixel % self.size.width);
+            let around = |middle: usize, end: usize| middle.saturating_sub(1)..(middle + 2).min(end);
+            around(row, self.size.height).any(|row| around(column, self.size.width).any(|column| is_mover(row, column)))
+        };
+        let points = rays.into_iter().zip(depths).enumerate();
+        points
+            .filter(|&(pixel, _)| !is_beside_mover(pixel))
             .map(|(_, (ray, depth))| ray.map(|part| part * depth))
             .collect()
     }
 
-    /// The places where movers stand, seen by a camera that has moved by yaw, ahead and left; in the axes before.
-    pub(super) fn movers(&self, logits: &[f32], motion: [f32; 3]) -> Vec<[f32; 2]> {
+    /// The places where movers stand, seen by a camera that has moved by yaw, ahead and left; in the axes before. `depths`: of the
+    /// pixels, where they are known.
+    pub(super) fn movers(&self, logits: &[f32], motion: [f32; 3], depths: Option<&[f32]>) -> Vec<[f32; 2]> {
         let rays = self.viewer.rays();
         let moved = CameraPose::default().moved(motion);
         let (sin, cos) = moved.heading.sin_cos();
         let nearest: Vec<Option<[f32; 2]>> = (0..self.size.width)
-            .map(|column| self.nearest(&rays, logits, column))
+            .map(|column| self.nearest(&rays, logits, column, depths))
             .collect();
         let mut places = Vec::new();
         for (column, place) in nearest.iter().enumerate() {
@@ -72,25 +92,27 @@ impl OccupancyView {
     }
 
     /// Where the mover in a column meets the floor: metres ahead and to the left of the camera.
-    fn nearest(&self, rays: &[[f32; 3]], logits: &[f32], column: usize) -> Option<[f32; 2]> {
+    fn nearest(&self, rays: &[[f32; 3]], logits: &[f32], column: usize, depths: Option<&[f32]>) -> Option<[f32; 2]> {
         let pixel = |row: usize| row * self.size.width + column;
         let is_mover = |row: usize| probability(logits[pixel(row)]) >= MOVER_PROBABILITY;
         let mut rows = (LEAST_PIXELS - 1..self.size.height).rev();
         let row = rows.find(|&row| (row + 1 - LEAST_PIXELS..=row).all(is_mover))?;
         // Where the mover ends and the floor begins.
         let below = rays[pixel((row + 1).min(self.size.height - 1))];
-        let [ahead, left, up] = std::array::from_fn(|axis| 0.5 * (rays[pixel(row)][axis] + below[axis]));
-        (up < 0.0).then(|| [ahead, left].map(|part| part * self.height_m / -up))
-    }
-
-    /// Whether the pixel or one beside it belongs to a mover: depths at its edge are between those of both sides.
-    fn is_beside_mover(&self, logits: &[f32], pixel: usize) -> bool {
-        let (row, column) = (pixel / self.size.width, pixel % self.size.width);
-        let around = |middle: usize, end: usize| middle.saturating_sub(1)..(middle + 2).min(end);
-        around(row, self.size.height).any(|row| {
-            around(column, self.size.width)
-                .any(|column| probability(logits[row * self.size.width + column]) >= MOVER_PROBABILITY)
-        })
+        let ray: [f32; 3] = std::array::from_fn(|axis| 0.5 * (rays[pixel(row)][axis] + below[axis]));
+        let [ahead, left, up] = ray;
+        if up >= 0.0 {
+            return None;
+        }
+        let mut depth = self.height_m / -up;
+        if row + 1 == self.size.height {
+            // It stands nearer than the camera sees the floor.
+            depth = match depths {
+                Some(depths) => depth.min(depths[pixel(row)]),
+                None => depth * CUT_OFF_SHARE,
+            };
+        }
+        Some([ahead, left].map(|part| part * depth))
     }
 }
 
@@ -127,14 +149,14 @@ mod tests {
     #[test]
     fn a_mover_stands_where_its_lowest_pixels_meet_the_floor() {
         let view = view();
-        let places = view.movers(&logits(&view, 1.0, -0.1), [0.0; 3]);
+        let places = view.movers(&logits(&view, 1.0, -0.1), [0.0; 3], None);
         assert!(places.len() > 20);
         for [ahead, left] in &places {
             assert!((0.93..1.0 + MOVER_DEPTH_M + 0.07).contains(ahead), "{ahead}");
             assert!((-0.2..0.35).contains(left), "{left}");
         }
         // A camera that has driven and turned sees it elsewhere, but it is where it is.
-        let places = view.movers(&logits(&view, 1.0, -0.1), [std::f32::consts::FRAC_PI_2, 0.5, 0.2]);
+        let places = view.movers(&logits(&view, 1.0, -0.1), [std::f32::consts::FRAC_PI_2, 0.5, 0.2], None);
         for [ahead, left] in &places {
             assert!((0.1..0.75).contains(ahead), "{ahead}");
             assert!((1.1..1.6).contains(left), "{left}");
@@ -153,6 +175,21 @@ mod tests {
             fixed < SIZE.pixels() - movers && fixed > SIZE.pixels() - 2 * movers,
             "{fixed}"
         );
-        assert!(view.movers(&vec![-5.0; SIZE.pixels()], [0.0; 3]).is_empty());
+        assert!(view.movers(&vec![-5.0; SIZE.pixels()], [0.0; 3], None).is_empty());
+        // One false pixel is no mover, and takes no points away.
+        let mut lone = vec![-5.0; SIZE.pixels()];
+        lone[40 * SIZE.width + 20] = 5.0;
+        assert_eq!(view.points(&depths, Some(&lone)).len(), SIZE.pixels());
+    }
+
+    #[test]
+    fn a_mover_whose_feet_are_below_the_picture_is_near() {
+        let view = view();
+        let near = logits(&view, 0.25, -0.1);
+        assert!(near[63 * SIZE.width + 32] > 0.0, "it reaches the lower edge");
+        let least = |places: Vec<[f32; 2]>| places.iter().map(|place| place[0]).fold(f32::INFINITY, f32::min);
+        assert!(least(view.movers(&near, [0.0; 3], None)) < 0.3);
+        let depths = vec![0.2; SIZE.pixels()];
+        assert!(least(view.movers(&near, [0.0; 3], Some(&depths))) < 0.26);
     }
 }

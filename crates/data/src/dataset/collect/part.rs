@@ -10,14 +10,15 @@ use super::config::{CollectConfig, CollectProgress};
 use super::status::CollectionStatus;
 use super::{CollectWorkers, unfinished};
 use crate::dataset::DatasetError;
-use crate::dataset::store::arguments::{arguments_text, lock};
+use crate::dataset::store::arguments::{arguments_text, has_arguments, lock};
 
 /// Simulates the trials of some shards of a collection into the directory `config.out`, or continues. Several threads call
-/// `on_progress`. Errors: `Usage`, `World`, `OutExists`, `OtherArguments`, `Busy`, `Cancelled`, `Simulation`, `Io`.
+/// `on_progress`, and `on_saved` with the number of trials on disk. Errors: `Usage`, `World`, `OutExists`, `OtherArguments`, `Busy`, `Cancelled`, `Simulation`, `Io`.
 pub fn collect_part(
     config: &CollectConfig,
     shards: Range<usize>,
     on_progress: &(dyn Fn(CollectProgress) + Sync),
+    on_saved: &(dyn Fn(u64) + Sync),
     cancelled: &AtomicBool,
 ) -> Result<(), DatasetError> {
     config.validate()?;
@@ -38,6 +39,7 @@ pub fn collect_part(
         cancelled,
         failed: AtomicBool::new(false),
     };
+    on_saved(saved());
     workers.report(0);
     let results = std::thread::scope(|scope| {
         let work = || -> Result<(), DatasetError> {
@@ -48,6 +50,7 @@ pub fn collect_part(
                     if episodes.len() > before {
                         unfinished::save(&info, &config.out, shard, of_shard.of(shard).start, &episodes)
                             .inspect_err(|_| workers.fail())?;
+                        on_saved(saved());
                     }
                 }
                 if workers.is_stopped() {
@@ -73,13 +76,17 @@ pub fn collect_part(
 }
 
 /// Moves the trials that parts saved in these directories into the directory of the collection, which then need not simulate
-/// them. Directories without trials are skipped. Errors: `OutExists`, `OtherArguments`, `Busy`, `Io`.
+/// them. Directories without trials, and those of other arguments or another version of the program, are skipped. Errors: `OutExists`,
+/// `OtherArguments`, `Busy`, `Io`.
 pub fn take_parts(config: &CollectConfig, parts: &[PathBuf]) -> Result<(), DatasetError> {
     if matches!(CollectionStatus::of(config)?, CollectionStatus::Finished(_)) {
         return Ok(());
     }
     let _lock = lock(&config.out, &arguments_text(config))?;
     for part in parts {
+        if !matches!(has_arguments(part, &arguments_text(config)), Ok(true)) {
+            continue;
+        }
         let files = unfinished::files(part)?;
         for (from, to) in files.iter().map(|from| (from, unfinished::moved(from, &config.out))) {
             move_file(from, &to)?;

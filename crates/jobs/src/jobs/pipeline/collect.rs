@@ -5,6 +5,7 @@ use std::ops::Range;
 use std::sync::atomic::AtomicBool;
 
 use serde_json::json;
+use tracing::warn;
 
 use super::super::executor::{JobFailure, JobResult};
 use super::super::report::JobReporter;
@@ -63,15 +64,25 @@ impl Pipeline {
     ) -> Result<JobResult, JobFailure> {
         let (run, objects) = (run_key(report.id()), self.store.objects());
         config.out = objects.data_dir().join(&run);
-        if report.lease().token == 1 {
+        // What another version of the program began does not fit.
+        let is_stale = matches!(
+            CollectionStatus::of(&config),
+            Err(DatasetError::OutExists { .. } | DatasetError::OtherArguments { .. })
+        );
+        if report.lease().token == 1 || is_stale {
             retry.run(async || objects.delete(&run).await)?;
         }
-        let on_progress = |now: dataset::CollectProgress| {
-            report.progress(now.done, now.total, "simulating");
-            report.checkpoint(now.done);
-        };
-        retry.repeat_once_free(|| dataset::collect_part(&config, shards.clone(), &on_progress, retry.cancelled))?;
+        let on_progress = |now: dataset::CollectProgress| report.progress(now.done, now.total, "simulating");
+        let on_saved = |trials| report.checkpoint(trials);
+        retry.repeat_once_free(|| {
+            dataset::collect_part(&config, shards.clone(), &on_progress, &on_saved, retry.cancelled)
+        })?;
         retry.run(async || objects.push(&run, LAST_FILE).await)?;
+        if objects.are_shared()
+            && let Err(error) = std::fs::remove_dir_all(&config.out)
+        {
+            warn!(job.id = %report.id(), %error, "could not delete this worker's copy of a part");
+        }
         Ok(JobResult::of(json!({"shards": [shards.start, shards.end]})))
     }
 

@@ -19,9 +19,17 @@ impl Pipeline {
         retry: &RetryPolicy<'_>,
     ) -> Result<JobResult, JobFailure> {
         let parts = retry.run(async || self.store.parts(report.id()).await)?;
+        let settings = spec.sweep.points();
+        if parts.len() != settings.len() {
+            return Err(JobFailure::Failed(format!(
+                "{} of its {} trainings were deleted",
+                settings.len().saturating_sub(parts.len()),
+                settings.len()
+            )));
+        }
         let mut points: Vec<Value> = parts
             .iter()
-            .zip(spec.sweep.points())
+            .zip(settings)
             .map(|(part, settings)| point(part, &settings))
             .collect();
         points.sort_by(|a, b| error_of(a).total_cmp(&error_of(b)));
