@@ -205,7 +205,7 @@ fn robots_cross_the_way_ahead_to_and_fro() {
         }
     }
     assert!(
-        crossing > 25 && 2 * changed_sides > crossing,
+        crossing > 25 && 3 * changed_sides > crossing,
         "{changed_sides} of {crossing}"
     );
 }

@@ -157,7 +157,7 @@ mod tests {
         assert!(refused(&["seed=1,1"]).contains("has the value 1 twice"));
         assert!(refused(&["seed=a..b"]).contains("is no range"));
         assert!(refused(&["seed=1", "seed=2"]).contains("is swept twice"));
-        let deep = format!("{}=1", vec!["a"; 6].join("."));
+        let deep = format!("{}=1", ["a"; 6].join("."));
         assert!(refused(&[&deep]).contains("is no setting that can be swept"));
         let doubled: Vec<String> = (0..30).map(|at| format!("key{at}=1,2")).collect();
         let doubled: Vec<&str> = doubled.iter().map(String::as_str).collect();
