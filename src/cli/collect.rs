@@ -73,7 +73,8 @@ impl fmt::Display for CollectSubject {
   foreframe collect --scenario moving-mnist --digits mnist/ --trials 10000")]
 pub(super) struct CollectArgs {
     /// static-observer (the camera stands, one robot drives), moving-observer (the camera robot drives too), crowded
-    /// (several robots drive) or moving-mnist (two digits move over a black square; needs --digits)
+    /// (several robots drive), crossing (robots drive to and fro across the way ahead) or moving-mnist (two digits move
+    /// over a black square; needs --digits)
     #[arg(long, default_value = "static-observer")]
     scenario: CollectSubject,
     /// For moving-mnist: an IDX file of digits (.gz or not), a folder with MNIST's train-images and t10k-images files, or a

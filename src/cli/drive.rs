@@ -14,10 +14,11 @@ use foreframe_train::evaluation::drive::{self, DriveScore, DriveSettings, Driver
 
 /// Let robots drive to goals in the simulator, with several drivers in the same episodes.
 ///
-/// The drivers: pid drives straight to the goal and sees nothing; stop does the same, but stands while the model's depth network sees
-/// something on its way; plan follows the plan that the model finds, anew at every frame; velocity does the same, but expects movers
-/// to go on as fast as in the last frames; simulator plans with the simulator itself as the model, the upper limit. Goals can be reached on a straight line, but for the other robots. All drivers know where the
-/// goal is. The table has means over the episodes with 95 % bootstrap intervals.
+/// The drivers: pid drives straight to the goal and sees nothing; stop does the same, but stands while the model sees something on
+/// its way; plan follows the plan that the model finds, anew at every frame; velocity does the same, but expects movers to go on as
+/// fast as in the last frames; simulator plans with the simulator itself as the model, the upper limit. Goals can be reached on a
+/// straight line, but for the other robots. All drivers know where the goal is. The table has means over the episodes with 95 %
+/// bootstrap intervals.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   foreframe drive --scenario crowded --episodes 50 --driver pid,simulator
@@ -44,7 +45,7 @@ pub(super) struct DriveArgs {
     /// Longest time of an episode, in seconds
     #[arg(long, value_name = "S", default_value_t = 20.0)]
     duration: f64,
-    /// The time for each plan of the driver plan, in milliseconds; without it, searches are whole, and a drive can be repeated
+    /// The time for each plan of the drivers velocity and plan, in milliseconds; without it, searches are whole, and a drive can be repeated
     #[arg(long, value_name = "MS", value_parser = clap::value_parser!(u64).range(1..=10_000))]
     budget_ms: Option<u64>,
     /// Print the scores and all episodes as JSON

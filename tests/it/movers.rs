@@ -7,7 +7,7 @@ use candle_core::{Device, Tensor};
 use foreframe_core::nn::{ConditioningTensors, FlowPrediction};
 use foreframe_core::registry::{self, StoredWeights};
 use foreframe_core::types::Seed;
-use foreframe_data::dataset::{Dataset, DatasetInfo};
+use foreframe_data::dataset::{Dataset, DatasetInfo, EpisodeData};
 use foreframe_sim::{RoomSet, Scenario, World, WorldConfig, arena};
 use foreframe_train::training::{TrainConfig, TrainError, Training, TrainingOutcome, run};
 
@@ -110,25 +110,22 @@ fn a_network_learns_where_movers_are_and_will_be() {
 fn movers_cannot_be_learned_without_masks_weight_or_depth() {
     let dir = tempfile::tempdir().unwrap();
     let masked = moving_squares(20, SIDE, 0.2);
-    let episodes = masked
-        .episodes()
-        .iter()
-        .map(|episode| foreframe_data::dataset::EpisodeData {
-            timestamps_s: episode.frames().map(|frame| masked.timestamp_s(frame)).collect(),
-            pixels: episode
-                .frames()
-                .flat_map(|frame| masked.pixels(frame).unwrap().into_owned())
-                .collect(),
-            actions: episode
-                .frames()
-                .flat_map(|frame| masked.action(frame).to_vec())
-                .collect(),
-            states: episode
-                .frames()
-                .flat_map(|frame| masked.state(frame).to_vec())
-                .collect(),
-            ..foreframe_data::dataset::EpisodeData::default()
-        });
+    let episodes = masked.episodes().iter().map(|episode| EpisodeData {
+        timestamps_s: episode.frames().map(|frame| masked.timestamp_s(frame)).collect(),
+        pixels: episode
+            .frames()
+            .flat_map(|frame| masked.pixels(frame).unwrap().into_owned())
+            .collect(),
+        actions: episode
+            .frames()
+            .flat_map(|frame| masked.action(frame).to_vec())
+            .collect(),
+        states: episode
+            .frames()
+            .flat_map(|frame| masked.state(frame).to_vec())
+            .collect(),
+        ..EpisodeData::default()
+    });
     let info = DatasetInfo {
         content_hash: String::new(),
         ..masked.info().clone()

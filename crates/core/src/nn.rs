@@ -9,8 +9,8 @@
 //! pixels of the last frame. Neither uses the other. [`network`] is the type that the rest of the program uses for both.
 //!
 //! The modules in reading order; each uses only those above it: `options` (enumerations) → [`error`] → [`tensors`] → `fused`
-//! (what an operation with a gradient of its own is) → `ops` (such operations) → [`loss`], [`ssim_loss`], [`mask_loss`] → [`spec`] (sizes and
-//! meaning of a model) → `model_tensors`, `conditioning` (actions and state) → `geometry` (cameras and wheels) → [`dense`], [`flow`] → `model_size` (tensors and cost) → `init`, [`parameters`] →
+//! (what an operation with a gradient of its own is) → `ops` (such operations) → [`loss`], [`ssim_loss`], [`mask_loss`] →
+//! [`spec`] (sizes and meaning of a model) → `model_tensors`, `conditioning` (actions and state) → `geometry` (cameras and wheels) → [`dense`], [`flow`] → `model_size` (tensors and cost) → `init`, [`parameters`] →
 //! [`network`]. [`costs`] compares the model's cost with other networks.
 
 mod conditioning;

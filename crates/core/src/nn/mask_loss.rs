@@ -14,8 +14,7 @@ pub fn mask_loss(logits: &Tensor, mask: &Tensor) -> Result<Tensor, NnError> {
 }
 
 /// The probability that a logit stands for.
-#[must_use]
-pub fn probability(logit: f32) -> f32 {
+fn probability(logit: f32) -> f32 {
     1.0 / (1.0 + (-logit).exp())
 }
 

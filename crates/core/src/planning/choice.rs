@@ -35,7 +35,8 @@ pub struct PlanCandidate {
     pub costs: Vec<(PlanCost, f32)>,
     /// Yaw, ahead and left since the last frame after each action, in radians and metres; `None` if the actions are no speeds.
     pub motion: Option<Vec<[f32; 3]>>,
-    /// The least distance from the robot's footprint to what the last frame shows, and to where movers will be, in metres; `None` if that is not known.
+    /// The least distance from the robot's footprint to what the last frame shows and to where movers will be, in metres; `None` if
+    /// that is not known.
     pub clearance_m: Option<f32>,
     /// What the camera is predicted to show; `None` if there was no time to predict it.
     pub rollout: Option<Rollout>,

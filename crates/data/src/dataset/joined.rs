@@ -13,8 +13,8 @@ const MAX_PERIOD_RATIO: f64 = 1.1;
 impl Dataset {
     /// Joins data sets, each with its weight: the share of a part is its weight over the sum of all. Frame size, frame period
     /// and channels are those of the first. The channels of the others are found by name and unit; those that the first does
-    /// not have are left out, and masks unless all have them. One data set stays as it is. Errors: `Usage` if there is none, a weight is not
-    /// above 0, a data set occurs twice, or sizes, periods or channels do not fit.
+    /// not have are left out, and masks unless all have them. One data set stays as it is. Errors: `Usage` if there is none, a
+    /// weight is not above 0, a data set occurs twice, or sizes, periods or channels do not fit.
     pub fn join(mut weighted: Vec<(Self, f64)>) -> Result<Self, DatasetError> {
         check_weights(&weighted)?;
         if weighted.len() == 1 {

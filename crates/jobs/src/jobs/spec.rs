@@ -54,7 +54,7 @@ pub struct CollectSpec {
     #[serde(deserialize_with = "name")]
     #[schema(value_type = String, pattern = "^[a-z0-9][a-z0-9-]{0,63}$")]
     pub name: DatasetName,
-    /// `static-observer`, `moving-observer` or `crowded`.
+    /// `static-observer`, `moving-observer`, `crowded` or `crossing`.
     pub scenario: String,
     /// Trials, 1 to 1,000,000.
     #[schema(minimum = 1, maximum = 1_000_000)]

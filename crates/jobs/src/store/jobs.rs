@@ -102,7 +102,8 @@ impl Store {
         Ok(EnqueueResult::New(row))
     }
 
-    /// Enqueues a failed or cancelled job again, with those of its parts that failed or were cancelled; `None` if it is neither. Errors: `Query`.
+    /// Enqueues a failed or cancelled job again, with those of its parts that failed or were cancelled; `None` if it is neither.
+    /// Errors: `Query`.
     pub async fn requeue(&self, id: JobId, max_queued: i64, by: &Author) -> Result<Option<EnqueueResult>, StoreError> {
         let now_s = self.database.now_s().await?;
         let mut tx = self.database.begin().await?;

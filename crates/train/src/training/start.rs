@@ -10,7 +10,8 @@ use foreframe_core::types::Seed;
 /// Prefix of the names of the tensors that find movers.
 const MOVERS_PREFIX: &str = "flow.movers.";
 
-/// The weights of another model; if only this training's network finds movers, what finds them is random. Errors: `OtherNetwork` if they do not fit this training's network, `OtherUnits`.
+/// The weights of another model; if only this training's network finds movers, what finds them starts at random. Errors:
+/// `OtherNetwork` if they do not fit this training's network, `OtherUnits`.
 pub(super) fn parameters(plan: &TrainingPlan<'_>, start: &StoredWeights, seed: Seed) -> Result<Parameters, TrainError> {
     let (from, to) = (&start.manifest.spec, &plan.spec);
     let used = [

@@ -2,14 +2,14 @@
 //! expected. A mover stands on the floor, so its lowest pixels tell how far away it is.
 
 use crate::nn::geometry::camera::{CameraPose, Viewer};
-use crate::nn::mask_loss::probability;
 use crate::nn::ops::sampling::ImageSize;
 
-/// A pixel with at least this probability belongs to a mover.
-pub(super) const MOVER_PROBABILITY: f32 = 0.5;
+/// A pixel whose logit is above this belongs to a mover: it is more likely than not.
+const MOVER_LOGIT: f32 = 0.0;
 /// Pixels of a column, one above the other, that make a mover. One alone is more often an error.
 const LEAST_PIXELS: usize = 2;
-/// A mover whose feet are below the picture stands at this share of the distance at which the camera sees the floor, if no depth tells.
+/// A mover whose feet are below the picture stands at this share of the distance at which the camera sees the floor, if no
+/// depth tells.
 const CUT_OFF_SHARE: f32 = 0.6;
 /// Columns to each side whose mover counts as the same.
 const COLUMNS_BESIDE: usize = 2;
@@ -50,8 +50,7 @@ impl OccupancyView {
             None => vec![false; self.size.width],
         };
         let is_mover = |row: usize, column: usize| {
-            has_place[column]
-                && movers.is_some_and(|logits| probability(logits[row * self.size.width + column]) >= MOVER_PROBABILITY)
+            has_place[column] && movers.is_some_and(|logits| logits[row * self.size.width + column] > MOVER_LOGIT)
         };
         // Depths at the edge of a mover are between those of both sides.
         let is_beside_mover = |pixel: usize| {
@@ -94,7 +93,7 @@ impl OccupancyView {
     /// Where the mover in a column meets the floor: metres ahead and to the left of the camera.
     fn nearest(&self, rays: &[[f32; 3]], logits: &[f32], column: usize, depths: Option<&[f32]>) -> Option<[f32; 2]> {
         let pixel = |row: usize| row * self.size.width + column;
-        let is_mover = |row: usize| probability(logits[pixel(row)]) >= MOVER_PROBABILITY;
+        let is_mover = |row: usize| logits[pixel(row)] > MOVER_LOGIT;
         let mut rows = (LEAST_PIXELS - 1..self.size.height).rev();
         let row = rows.find(|&row| (row + 1 - LEAST_PIXELS..=row).all(is_mover))?;
         // Where the mover ends and the floor begins.

@@ -13,7 +13,8 @@ use crate::dataset::DatasetError;
 use crate::dataset::store::arguments::{arguments_text, has_arguments, lock};
 
 /// Simulates the trials of some shards of a collection into the directory `config.out`, or continues. Several threads call
-/// `on_progress`, and `on_saved` with the number of trials on disk. Errors: `Usage`, `World`, `OutExists`, `OtherArguments`, `Busy`, `Cancelled`, `Simulation`, `Io`.
+/// `on_progress`, and `on_saved` with the number of trials on disk. Errors: `Usage`, `World`, `OutExists`, `OtherArguments`,
+/// `Busy`, `Cancelled`, `Simulation`, `Io`.
 pub fn collect_part(
     config: &CollectConfig,
     shards: Range<usize>,
