@@ -75,8 +75,13 @@ pub(in crate::server) async fn trace(State(trace): State<RequestTrace>, request:
         let started = Instant::now();
         let answered = async {
             refuse_encoded(request.headers())?;
+            let is_whole = request.body().is_end_stream();
             let late = |_| {
                 let limit_ms = limit.as_millis();
+                if is_whole {
+                    // It is not the client that was slow.
+                    return ApiError::unavailable(format!("no answer was ready within {limit_ms} ms"));
+                }
                 ApiError::Timeout(format!(
                     "the request took longer than {limit_ms} ms to arrive and be answered"
                 ))
