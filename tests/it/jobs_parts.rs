@@ -1,12 +1,13 @@
-//! Collections in parts: the same bytes as one worker, also if workers are killed.
+//! Collections and evaluations in parts: the same bytes as one worker, also if workers are killed.
 
 use std::collections::BTreeMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use foreframe::server::ServerConfig;
 use serde_json::{Value, json};
+use tempfile::TempDir;
 
-use crate::jobs_killed::{ask, serve, start, wait_for, wait_until};
+use crate::jobs_killed::{KillOnDrop, address, ask, serve, start, wait_for, wait_until};
 use crate::service::{app, get, poll_until, post};
 
 fn collect(name: &str, parts: usize) -> Value {
@@ -68,6 +69,46 @@ async fn a_collection_in_parts_has_the_same_bytes() {
     assert!(refused.starts_with("part: only the server makes parts"), "{refused}");
 }
 
+/// Three machines with one database and one object store: each has a data directory of its own.
+struct Machines {
+    shared: TempDir,
+    own: [TempDir; 3],
+}
+
+impl Machines {
+    fn new() -> Self {
+        let new = || tempfile::tempdir().unwrap();
+        Self {
+            shared: new(),
+            own: [(); 3].map(|()| new()),
+        }
+    }
+
+    fn objects(&self) -> PathBuf {
+        self.shared.path().join("objects")
+    }
+
+    fn start(&self, machine: usize, arguments: &[&str]) -> (KillOnDrop, String) {
+        let database = format!("sqlite:{}", self.shared.path().join("jobs.db").display());
+        let objects = self.objects().display().to_string();
+        let store = ["--database-url", &database, "--objects-url", &objects];
+        start(
+            self.own[machine].path(),
+            &[arguments, &store, &["--set", "job_lease_ms=1000"]].concat(),
+        )
+    }
+
+    /// A server without workers.
+    fn serve(&self) -> (KillOnDrop, String) {
+        let (server, line) = self.start(0, &["serve", "--bind", "127.0.0.1:0", "--run-jobs", "false"]);
+        (server, address(&line))
+    }
+
+    fn worker(&self, machine: usize) -> KillOnDrop {
+        self.start(machine, &["worker"]).0
+    }
+}
+
 #[test]
 fn a_killed_worker_leaves_its_part_to_another() {
     let alone = tempfile::tempdir().unwrap();
@@ -76,29 +117,86 @@ fn a_killed_worker_leaves_its_part_to_another() {
     wait_for(&address, "job-1", "succeeded");
     drop(server);
 
-    // Three machines: each has a data directory of its own.
-    let shared = tempfile::tempdir().unwrap();
-    let machines = [(); 3].map(|()| tempfile::tempdir().unwrap());
-    let database = format!("sqlite:{}", shared.path().join("jobs.db").display());
-    let objects = shared.path().join("objects").display().to_string();
-    let store = [
-        "--database-url",
-        &database,
-        "--objects-url",
-        &objects,
-        "--set",
-        "job_lease_ms=1000",
-    ];
-    let (_server, address) = serve(machines[0].path(), &[&store[..], &["--run-jobs", "false"]].concat());
-    let worker = |machine: &tempfile::TempDir| start(machine.path(), &[&["worker"], &store[..]].concat()).0;
+    let machines = Machines::new();
+    let (_server, address) = machines.serve();
     ask(&address, "POST /v1/jobs", &collect("seen", 2));
-    let killed = worker(&machines[1]);
+    let killed = machines.worker(1);
     wait_until(&address, "job-2", |job| job["progress"]["done"].as_u64().unwrap() > 0);
     drop(killed);
-    let _other = worker(&machines[2]);
+    let _other = machines.worker(2);
     let job = wait_for(&address, "job-1", "succeeded");
     assert_eq!(job["parts"], json!({"total": 2, "done": 2, "running": 0, "failed": 0}));
     assert_eq!(ask(&address, "GET /v1/jobs/job-2", &Value::Null)["attempts"], 2);
-    let made = files(&Path::new(&objects).join("datasets/seen"));
+    let made = files(&machines.objects().join("datasets/seen"));
     assert!(made == files(&alone.path().join("datasets/seen")));
+}
+
+/// Small, and with two sets of several batches.
+fn train() -> Value {
+    let settings = json!({
+        "model": {"features": 8, "hidden": 8},
+        "data": {"windows": 8, "validation_windows": 4},
+        "pretrain": {"steps": 3, "batch_size": 4},
+        "sequence": {"steps": 3, "batch_size": 4},
+        "run": {"validate_every_steps": 3, "checkpoint_every_steps": 3},
+    });
+    json!({"kind": "train", "name": "m", "preset": "paper", "dataset": "seen", "settings": settings})
+}
+
+fn evaluate(parts: usize) -> Value {
+    json!({"kind": "evaluate", "model": "m", "dataset": "seen", "windows": 200, "resamples": 100, "parts": parts})
+}
+
+/// The files of a report; its duration is replaced.
+fn report(dir: &Path) -> BTreeMap<String, Vec<u8>> {
+    let mut files = files(dir);
+    let json: Value = serde_json::from_slice(&files["report.json"]).unwrap();
+    assert!(json["sets"][0]["windows"].as_u64().unwrap() > 128, "{json}");
+    let duration = json["stamp"]["wall_time_s"].to_string();
+    let shown = format!("{:.0} s", json["stamp"]["wall_time_s"].as_f64().unwrap());
+    for (name, text) in &mut files {
+        if name.ends_with(".json") || name.ends_with(".md") {
+            let plain = String::from_utf8(text.clone()).unwrap();
+            *text = plain
+                .replace(&duration, "DURATION")
+                .replace(&shown, "DURATION")
+                .into_bytes();
+        }
+    }
+    files
+}
+
+#[test]
+fn an_evaluation_in_parts_gives_the_same_report_though_a_worker_is_killed() {
+    let machines = Machines::new();
+    let (_server, address) = machines.serve();
+    let run = |body: &Value| -> String {
+        let job = ask(&address, "POST /v1/jobs", body);
+        job["id"].as_str().unwrap_or_else(|| panic!("{job}")).to_owned()
+    };
+    run(&collect("seen", 1));
+    let mut training = train();
+    training["after"] = json!("job-1");
+    run(&training);
+    let first = machines.worker(1);
+    wait_for(&address, "job-2", "succeeded");
+    let whole = run(&evaluate(1));
+    wait_for(&address, &whole, "succeeded");
+
+    let id = run(&evaluate(3));
+    assert_eq!(id, "job-4");
+    wait_until(&address, "job-5", |job| job["progress"]["done"].as_u64().unwrap() > 0);
+    drop(first);
+    let _other = machines.worker(2);
+    let job = wait_for(&address, &id, "succeeded");
+    assert_eq!(job["parts"], json!({"total": 3, "done": 3, "running": 0, "failed": 0}));
+    let reports = machines.objects().join("reports");
+    let [whole, parts] = [whole, id].map(|id| report(&reports.join(id)));
+    assert_eq!(whole.keys().collect::<Vec<_>>(), parts.keys().collect::<Vec<_>>());
+    for (name, bytes) in &whole {
+        assert!(bytes == &parts[name], "{name}");
+    }
+    // What the parts saved is deleted.
+    let runs: Vec<String> = files(&machines.objects().join("runs")).into_keys().collect();
+    assert!(runs.iter().all(|file| file.starts_with("job-2/")), "{runs:?}");
 }

@@ -25,6 +25,7 @@ mod deleted_versions;
 mod deployment;
 mod environments;
 mod evaluation;
+mod evaluation_parts;
 mod export_mcap;
 mod fixtures;
 mod goal_image;
