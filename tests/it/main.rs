@@ -36,6 +36,7 @@ mod import_hostile;
 mod import_killed;
 mod import_memory;
 mod import_names;
+mod import_parts;
 mod import_programs;
 mod import_videos;
 mod inference_protocol;

@@ -56,7 +56,7 @@ use self::inference::Inference;
 use self::measurements::Measurements;
 use self::method::Method;
 use self::progress::EvaluationContext;
-use self::report::{ModelSummary, ReportStamp, SetOutcome, SetReport};
+use self::report::{ModelSummary, NearestSummary, ReportStamp, SetOutcome, SetReport};
 use self::windows::{evenly, window_shape};
 use foreframe_core::registry::Model;
 use foreframe_core::types::Seed;
@@ -64,6 +64,9 @@ use foreframe_data::dataset::moving_mnist::MOVING_MNIST;
 use foreframe_data::dataset::sampler::{Split, Splits};
 use foreframe_data::dataset::{Dataset, Window};
 use foreframe_sim::RoomSet;
+
+/// What a part saves of how the nearest windows are weighed, which takes as long as scoring hundreds of windows.
+const NEAREST: &str = "nearest-windows";
 
 /// Scores the model on the splits that [`EvaluateConfig::split`] names: the validation split, the three test sets
 /// (trials, start/goal pairs and gains that training never saw), or the whole data set. Rooms that are only for tests are
@@ -215,15 +218,20 @@ impl<'a> HeldOut<'a> {
 }
 
 /// The baselines for this data set. Where all of it is for testing, they are fitted to its own frames, and there is no
-/// training window to find. Errors: those of [`Splits::windows`].
+/// training window to find. Errors: those of [`Splits::windows`], and `Io`.
 fn fitted_baselines(evaluation: &EvaluationContext, splits: &Splits) -> Result<Baselines, EvaluationError> {
     let (Inference { loaded, dataset }, config) = (evaluation.inference, evaluation.config);
     let (spec, trained_on) = (loaded.spec(), &loaded.manifest.dataset);
-    let fit = |splits: &Splits, searched| Baselines::fit(dataset, splits, window_shape(spec), searched);
+    let known = evaluation.division.saved::<NearestSummary>(NEAREST).remove(&0);
+    let known = known.and_then(|saved| saved.first().copied());
+    let fit = |splits: &Splits, searched| Baselines::fit(dataset, splits, window_shape(spec), searched, known);
     let mut baselines = match config.split {
         ScoredSplit::WholeSet => fit(&Splits::new(dataset, trained_on.split_seed), 0)?,
         _ => fit(splits, config.nearest_windows)?,
     };
+    if let Some(chosen) = baselines.nearest_summary().filter(|_| known.is_none()) {
+        evaluation.division.save(NEAREST, 0, &[vec![chosen]])?;
+    }
     let scenarios = [&trained_on.scenario, &dataset.info().scenario];
     if scenarios
         .iter()

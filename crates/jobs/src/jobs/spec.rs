@@ -169,7 +169,7 @@ impl JobSpec {
             Self::Train(spec) => spec.parts().into_iter().map(Self::Train).collect(),
             Self::Collect(spec) => spec.parts().into_iter().map(Self::Collect).collect(),
             Self::Evaluate(spec) => spec.parts().into_iter().map(Self::Evaluate).collect(),
-            Self::Import(_) => Vec::new(),
+            Self::Import(spec) => spec.parts().into_iter().map(Self::Import).collect(),
         }
     }
 

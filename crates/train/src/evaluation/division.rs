@@ -93,7 +93,7 @@ impl<'a> Division<'a> {
             first,
             batches,
         };
-        let bytes = rmp_serde::to_vec(&saved).expect("numbers that MessagePack cannot hold are a bug");
+        let bytes = rmp_serde::to_vec(&saved).expect("a number that MessagePack cannot hold is a bug");
         let path = path(&part.dir, pass);
         write_atomically(&path, &bytes).map_err(|source| EvaluationError::Io { path, source })
     }

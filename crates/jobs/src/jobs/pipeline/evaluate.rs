@@ -10,6 +10,7 @@ use super::super::executor::{JobFailure, JobResult};
 use super::super::report::JobReporter;
 use super::super::retry_policy::RetryPolicy;
 use super::super::{EvaluateSpec, JobSpec};
+use super::parts::LAST_FILE;
 use super::{Pipeline, failed, report_key, request_line, run_key};
 use crate::store::{JobId, ModelMetrics, StoreError};
 use crate::versions::VersionError;
@@ -21,9 +22,6 @@ use foreframe_train::evaluation::figures::Figure;
 use foreframe_train::evaluation::{
     self, EvaluateConfig, EvaluationError, EvaluationPart, EvaluationProgress, EvaluationReport,
 };
-
-/// The file of a part that is written last. It says which attempt made the others.
-const LAST_FILE: &str = "part.json";
 
 /// The file of an evaluation's report that is written last.
 const REPORT_FILE: &str = "report.json";
@@ -103,10 +101,7 @@ impl Pipeline {
         };
         let computed = evaluation::run_part(loaded, dataset, config, part, &on_progress);
         computed.map_err(|error| failed(&error))?;
-        let attempt = json!({"part": part.index, "parts": part.count, "attempt": report.lease().token});
-        std::fs::write(part.dir.join(LAST_FILE), attempt.to_string()).map_err(|error| failed(&error))?;
-        self.push_part(LAST_FILE, report, retry)?;
-        Ok(JobResult::of(json!({"part": part.index, "parts": part.count})))
+        self.finish_part((part.index, part.count), report, retry)
     }
 
     /// Writes the report and copies it to the object store, if there is a shared one; returns the names of its files.

@@ -4,14 +4,18 @@
 use std::fs;
 use std::path::PathBuf;
 
+use serde_json::json;
 use tracing::warn;
 
 use super::super::JobState;
-use super::super::executor::JobFailure;
+use super::super::executor::{JobFailure, JobResult};
 use super::super::report::JobReporter;
 use super::super::retry_policy::RetryPolicy;
 use super::{Pipeline, failed, run_key};
 use crate::store::JobRow;
+
+/// The file of a part that is written last. It says which attempt made the others.
+pub(super) const LAST_FILE: &str = "part.json";
 
 impl Pipeline {
     /// The parts of a job; none if it is done as a whole. Errors: `Failed` if one did not succeed.
@@ -34,6 +38,25 @@ impl Pipeline {
             retry.run(async || objects.delete(&run).await)?;
         }
         fs::create_dir_all(objects.data_dir().join(&run)).map_err(|error| failed(&error))
+    }
+
+    /// Writes that an attempt of a part, by its index and their count, has saved everything, and copies all to the object store.
+    pub(super) fn finish_part(
+        &self,
+        (index, count): (usize, usize),
+        report: &JobReporter,
+        retry: &RetryPolicy<'_>,
+    ) -> Result<JobResult, JobFailure> {
+        let path = self
+            .store
+            .objects()
+            .data_dir()
+            .join(run_key(report.id()))
+            .join(LAST_FILE);
+        let text = json!({"part": index, "parts": count, "attempt": report.lease().token}).to_string();
+        fs::write(path, text).map_err(|error| failed(&error))?;
+        self.push_part(LAST_FILE, report, retry)?;
+        Ok(JobResult::of(json!({"part": index, "parts": count})))
     }
 
     /// Copies what a part saved to the object store, if there is a shared one; the file `last` marks it as complete.
