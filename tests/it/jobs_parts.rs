@@ -172,7 +172,7 @@ fn report(dir: &Path) -> BTreeMap<String, Vec<u8>> {
     let json: Value = serde_json::from_slice(&files["report.json"]).unwrap();
     assert!(json["sets"][0]["windows"].as_u64().unwrap() > 64, "{json}");
     let duration = json["stamp"]["wall_time_s"].to_string();
-    let shown = format!("{:.0} s", json["stamp"]["wall_time_s"].as_f64().unwrap());
+    let shown = format!("| {:.1} s on", json["stamp"]["wall_time_s"].as_f64().unwrap());
     for (name, text) in &mut files {
         if name.ends_with(".json") || name.ends_with(".md") {
             let plain = String::from_utf8(text.clone()).unwrap();
