@@ -1,7 +1,8 @@
 //! Turns recordings of real robots into data sets.
 //!
 //! A source (`images`, `donkeycar`, `lerobot`, `numpy`, `npz`, `video` or `bag`) lists its records: time, action, state and where the image
-//! is. `archive` unpacks a source that is one. `timing` cuts them into episodes at one frame rate. `writer` reads the images, resizes them, and writes shards.
+//! is. `archive` unpacks a source that is one. `timing` cuts them into episodes at one frame rate. `encoder` reads the images and
+//! resizes them, `writer` writes shards. `part` saves some of the shards for another process, by `saved_shards`.
 //! Only one shard is in memory at a time.
 
 mod archive;

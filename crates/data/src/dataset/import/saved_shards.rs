@@ -102,6 +102,5 @@ fn hash(config: &ImportConfig, plan: &ImportPlan) -> String {
             }
         }
     }
-    let digest = hash.finalize();
-    digest.iter().map(|byte| format!("{byte:02x}")).collect()
+    format!("{:x}", hash.finalize())
 }
