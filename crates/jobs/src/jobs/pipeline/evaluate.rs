@@ -17,7 +17,6 @@ use crate::versions::VersionError;
 use foreframe_core::files::remove_dir;
 use foreframe_core::registry::Model;
 use foreframe_core::types::{ModelName, Seed};
-use foreframe_data::dataset::Dataset;
 use foreframe_train::evaluation::figures::Figure;
 use foreframe_train::evaluation::{
     self, EvaluateConfig, EvaluationError, EvaluationPart, EvaluationProgress, EvaluationReport,
@@ -25,6 +24,9 @@ use foreframe_train::evaluation::{
 
 /// The file of an evaluation's report that is written last.
 const REPORT_FILE: &str = "report.json";
+
+/// What is told of the progress of a part.
+type OnProgress<'a> = &'a (dyn Fn(EvaluationProgress) + Sync);
 
 impl Pipeline {
     pub(super) fn evaluate(
@@ -60,7 +62,9 @@ impl Pipeline {
                 index,
                 count: spec.parts,
             };
-            return self.evaluate_part(&loaded, &dataset, &config, &part, &retry);
+            let compute =
+                |on_progress: OnProgress| evaluation::run_part(&loaded, &dataset, &config, &part, on_progress);
+            return self.evaluate_part(&part, &retry, compute);
         }
         let found = evaluation::run(&loaded, &dataset, &config, &|now| show(report, now));
         let mut found = found.map_err(|error| failed(&error))?;
@@ -82,14 +86,12 @@ impl Pipeline {
         })
     }
 
-    /// Computes a part's share of the windows.
+    /// Computes a part's share of the windows, by `compute`.
     fn evaluate_part(
         &self,
-        loaded: &Model,
-        dataset: &Dataset,
-        config: &EvaluateConfig,
         part: &EvaluationPart,
         retry: &RetryPolicy<'_>,
+        compute: impl FnOnce(OnProgress) -> Result<(), EvaluationError>,
     ) -> Result<JobResult, JobFailure> {
         let report = retry.report;
         self.prepare_part(report, retry)?;
@@ -99,8 +101,7 @@ impl Pipeline {
             // Whole passes are saved; a new attempt continues after them.
             report.checkpoint(saved_files(&part.dir));
         };
-        let computed = evaluation::run_part(loaded, dataset, config, part, &on_progress);
-        computed.map_err(|error| failed(&error))?;
+        compute(&on_progress).map_err(|error| failed(&error))?;
         self.finish_part((part.index, part.count), report, retry)
     }
 
