@@ -17,9 +17,9 @@ use serde_json::{Value, json};
 
 use crate::fixtures::{self, moving_squares};
 
-const SIDE: u32 = 16;
+pub(crate) const SIDE: u32 = 16;
 
-fn spec(conditioning: Conditioning) -> ModelSpec {
+pub(crate) fn spec(conditioning: Conditioning) -> ModelSpec {
     ModelSpec {
         context: 4,
         horizon: 3,
@@ -29,7 +29,7 @@ fn spec(conditioning: Conditioning) -> ModelSpec {
 }
 
 /// An untrained model whose manifest names this data set as its training data.
-fn untrained(name: &str, spec: ModelSpec, dataset: &Dataset) -> Model {
+pub(crate) fn untrained(name: &str, spec: ModelSpec, dataset: &Dataset) -> Model {
     fixtures::model(
         tempfile::tempdir().unwrap().path(),
         name,
@@ -38,7 +38,7 @@ fn untrained(name: &str, spec: ModelSpec, dataset: &Dataset) -> Model {
     )
 }
 
-fn config() -> EvaluateConfig<'static> {
+pub(crate) fn config() -> EvaluateConfig<'static> {
     EvaluateConfig {
         max_windows: 15,
         bootstrap_samples: 100,

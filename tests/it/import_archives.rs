@@ -59,7 +59,7 @@ fn gzip(bytes: &[u8]) -> Vec<u8> {
     encoder.finish().unwrap()
 }
 
-fn zip(entries: &[(&str, &[u8])]) -> Vec<u8> {
+pub(crate) fn zip(entries: &[(&str, &[u8])]) -> Vec<u8> {
     let mut archive = zip::ZipWriter::new(std::io::Cursor::new(Vec::new()));
     for (name, content) in entries {
         archive.start_file(*name, SimpleFileOptions::default()).unwrap();
@@ -69,7 +69,7 @@ fn zip(entries: &[(&str, &[u8])]) -> Vec<u8> {
 }
 
 /// The files of a folder by their names below it.
-fn contents(root: &Path, prefix: &str) -> Vec<(String, Vec<u8>)> {
+pub(crate) fn contents(root: &Path, prefix: &str) -> Vec<(String, Vec<u8>)> {
     let paths = files_below(root).unwrap();
     let named = |path: PathBuf| {
         let name = path.strip_prefix(root).unwrap().to_str().unwrap();

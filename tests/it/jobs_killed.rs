@@ -49,8 +49,14 @@ pub(crate) fn start(data_dir: &Path, arguments: &[&str]) -> (KillOnDrop, String)
 
 pub(crate) fn serve(data_dir: &Path, more: &[&str]) -> (KillOnDrop, String) {
     let (program, line) = start(data_dir, &[&["serve", "--bind", "127.0.0.1:0"], more].concat());
+    let address = address(&line);
+    (program, address)
+}
+
+/// The address in a server's first line of output.
+pub(crate) fn address(line: &str) -> String {
     let address = line.split("http://").nth(1).unwrap().split('/').next().unwrap();
-    (program, address.to_owned())
+    address.to_owned()
 }
 
 /// Sends a request and returns the JSON body of the response.

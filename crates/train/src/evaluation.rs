@@ -9,6 +9,7 @@ pub mod bootstrap;
 mod calibrate;
 mod compatible;
 mod config;
+mod division;
 pub mod drive;
 mod error;
 pub mod figures;
@@ -17,6 +18,7 @@ mod html;
 mod inference;
 mod least_squares;
 mod markdown;
+mod measurements;
 pub mod method;
 pub mod metrics;
 mod novelty_scale;
@@ -38,6 +40,8 @@ use std::time::Instant;
 pub use self::calibrate::{calibrate, calibrate_trained};
 pub use self::compatible::check_fit;
 pub use self::config::{EvaluateConfig, NEAREST_WINDOWS, ScoredSplit};
+#[doc(hidden)]
+pub use self::division::EvaluationPart;
 pub use self::error::EvaluationError;
 pub use self::figures::draw_figures;
 pub use self::html::html_page;
@@ -47,16 +51,22 @@ pub use self::report::EvaluationReport;
 
 use self::baselines::Baselines;
 use self::bootstrap::is_recording;
+use self::division::Division;
 use self::inference::Inference;
+use self::measurements::Measurements;
 use self::method::Method;
 use self::progress::EvaluationContext;
-use self::report::{ModelSummary, ReportStamp, SetOutcome, SetReport, SetScores};
+use self::report::{ModelSummary, NearestSummary, ReportStamp, SetOutcome, SetReport};
 use self::windows::{evenly, window_shape};
 use foreframe_core::registry::Model;
+use foreframe_core::types::Seed;
 use foreframe_data::dataset::moving_mnist::MOVING_MNIST;
 use foreframe_data::dataset::sampler::{Split, Splits};
 use foreframe_data::dataset::{Dataset, Window};
 use foreframe_sim::RoomSet;
+
+/// What a part saves of how the nearest windows are weighed, which takes as long as scoring hundreds of windows.
+const NEAREST: &str = "nearest-windows";
 
 /// Scores the model on the splits that [`EvaluateConfig::split`] names: the validation split, the three test sets
 /// (trials, start/goal pairs and gains that training never saw), or the whole data set. Rooms that are only for tests are
@@ -69,44 +79,26 @@ pub fn run(
     on_progress: &(dyn Fn(EvaluationProgress) + Sync),
 ) -> Result<EvaluationReport, EvaluationError> {
     let started = Instant::now();
-    config.validate()?;
-    compatible::check(loaded, dataset)?;
-    let split_seed = compatible::split_seed(loaded, dataset, config.split_seed)?;
-    for twin in &config.twins {
-        actions::twin_variant(loaded, twin)?;
-        compatible::check(twin, dataset)?;
-        compatible::split_seed(twin, dataset, Some(split_seed))?;
-    }
-    let config = &EvaluateConfig {
-        split: config.split.of(loaded, dataset),
-        ..config.clone()
-    };
-    if config.split == ScoredSplit::WholeSet {
-        compatible::check_untrained(loaded, dataset)?;
-    }
-    let splits = config.split.divide(dataset, split_seed);
-    let mut tests = config.split.splits();
-    if is_recording(dataset) {
-        // A recording has no starts, goals or gains that could be held out.
-        tests = tests.get(..1).unwrap_or(tests);
-    }
-    if tests.iter().all(|&split| splits.episodes(split).is_empty()) {
-        return Err(EvaluationError::NothingHeldOut {
-            dataset: dataset.info().name.clone(),
-            split_seed: split_seed.0,
-        });
-    }
+    let HeldOut {
+        config,
+        split_seed,
+        splits,
+        tests,
+    } = &HeldOut::of(loaded, dataset, config)?;
+    let inference = Inference { loaded, dataset };
+    let division = Division::joined(division::inputs(inference, config, *split_seed), &config.saved);
     let mut evaluation = EvaluationContext {
-        inference: Inference { loaded, dataset },
+        inference,
         split: Split::Test,
         config,
+        division: &division,
         on_progress,
     };
-    let baselines = fitted_baselines(&evaluation, &splits)?;
+    let baselines = fitted_baselines(&evaluation, splits)?;
     let (mut sets, mut own_novelty) = (Vec::new(), Vec::new());
-    for &split in tests {
+    for &split in *tests {
         evaluation.split = split;
-        let (outcome, novelty) = score_split(&evaluation, &splits, &baselines)?;
+        let (outcome, novelty) = score_split(&evaluation, splits, &baselines)?;
         let rooms = config::test_rooms(dataset).filter(|_| config.split == ScoredSplit::WholeSet);
         sets.push(SetReport {
             split: rooms.map_or(split.name(), RoomSet::name).to_owned(),
@@ -117,6 +109,7 @@ pub fn run(
             own_novelty = novelty;
         }
     }
+    let undivided = Division::default();
     let compare = |&novel: &&Dataset| {
         let Some(calibration) = &loaded.manifest.calibration else {
             let model = loaded.manifest.name.clone();
@@ -125,13 +118,14 @@ pub fn run(
         let novel = EvaluationContext {
             inference: Inference { loaded, dataset: novel },
             split: Split::Test,
+            division: &undivided,
             ..evaluation
         };
         uncertainty::compare(&novel, calibration, &own_novelty)
     };
     Ok(EvaluationReport {
         novelty: config.novel.iter().map(compare).collect::<Result<_, _>>()?,
-        stamp: ReportStamp::new(&evaluation, split_seed, started.elapsed()),
+        stamp: ReportStamp::new(&evaluation, *split_seed, started.elapsed()),
         model: ModelSummary::of(loaded),
         nearest_windows: baselines.nearest_summary(),
         sets,
@@ -139,16 +133,105 @@ pub fn run(
     })
 }
 
+/// Computes a part of an evaluation, or continues it: its share of what [`run`] computes with the same `config`, in its directory.
+/// [`EvaluateConfig::saved`] then names the directories of all parts. What is missing there is computed by [`run`], so the report
+/// is the same in every case. Errors: as [`run`], and `Io`.
+#[doc(hidden)]
+pub fn run_part(
+    loaded: &Model,
+    dataset: &Dataset,
+    config: &EvaluateConfig,
+    part: &EvaluationPart,
+    on_progress: &(dyn Fn(EvaluationProgress) + Sync),
+) -> Result<(), EvaluationError> {
+    let HeldOut {
+        config,
+        split_seed,
+        splits,
+        tests,
+    } = &HeldOut::of(loaded, dataset, config)?;
+    let inference = Inference { loaded, dataset };
+    let division = Division::of_part(division::inputs(inference, config, *split_seed), part);
+    let mut evaluation = EvaluationContext {
+        inference,
+        split: Split::Test,
+        config,
+        division: &division,
+        on_progress,
+    };
+    let baselines = fitted_baselines(&evaluation, splits)?;
+    for &split in *tests {
+        evaluation.split = split;
+        let available = available_windows(&evaluation, splits)?;
+        if why_skipped(dataset, split, &available).is_none() {
+            Measurements::of(&evaluation, &evenly(&available, config.max_windows), &baselines)?;
+        }
+    }
+    Ok(())
+}
+
+/// What is scored: the splits that training did not see.
+struct HeldOut<'a> {
+    config: EvaluateConfig<'a>,
+    split_seed: Seed,
+    splits: Splits,
+    tests: &'static [Split],
+}
+
+impl<'a> HeldOut<'a> {
+    /// Errors: model, twins and data set that don't fit together, settings out of range, nothing held out, `TrainedOn`.
+    fn of(loaded: &Model, dataset: &Dataset, config: &EvaluateConfig<'a>) -> Result<Self, EvaluationError> {
+        config.validate()?;
+        compatible::check(loaded, dataset)?;
+        let split_seed = compatible::split_seed(loaded, dataset, config.split_seed)?;
+        for twin in &config.twins {
+            actions::twin_variant(loaded, twin)?;
+            compatible::check(twin, dataset)?;
+            compatible::split_seed(twin, dataset, Some(split_seed))?;
+        }
+        let config = EvaluateConfig {
+            split: config.split.of(loaded, dataset),
+            ..config.clone()
+        };
+        if config.split == ScoredSplit::WholeSet {
+            compatible::check_untrained(loaded, dataset)?;
+        }
+        let splits = config.split.divide(dataset, split_seed);
+        let mut tests = config.split.splits();
+        if is_recording(dataset) {
+            // A recording has no starts, goals or gains that could be held out.
+            tests = tests.get(..1).unwrap_or(tests);
+        }
+        if tests.iter().all(|&split| splits.episodes(split).is_empty()) {
+            return Err(EvaluationError::NothingHeldOut {
+                dataset: dataset.info().name.clone(),
+                split_seed: split_seed.0,
+            });
+        }
+        Ok(Self {
+            config,
+            split_seed,
+            splits,
+            tests,
+        })
+    }
+}
+
 /// The baselines for this data set. Where all of it is for testing, they are fitted to its own frames, and there is no
-/// training window to find. Errors: those of [`Splits::windows`].
+/// training window to find. Errors: those of [`Splits::windows`], and `Io`.
 fn fitted_baselines(evaluation: &EvaluationContext, splits: &Splits) -> Result<Baselines, EvaluationError> {
     let (Inference { loaded, dataset }, config) = (evaluation.inference, evaluation.config);
     let (spec, trained_on) = (loaded.spec(), &loaded.manifest.dataset);
-    let fit = |splits: &Splits, searched| Baselines::fit(dataset, splits, window_shape(spec), searched);
+    let known = evaluation.division.saved::<NearestSummary>(NEAREST).remove(&0);
+    let known = known.and_then(|saved| saved.first().copied());
+    let fit = |splits: &Splits, searched| Baselines::fit(dataset, splits, window_shape(spec), searched, known);
     let mut baselines = match config.split {
         ScoredSplit::WholeSet => fit(&Splits::new(dataset, trained_on.split_seed), 0)?,
         _ => fit(splits, config.nearest_windows)?,
     };
+    if let Some(chosen) = baselines.nearest_summary().filter(|_| known.is_none()) {
+        evaluation.division.save(NEAREST, 0, &[vec![chosen]])?;
+    }
     let scenarios = [&trained_on.scenario, &dataset.info().scenario];
     if scenarios
         .iter()
@@ -177,38 +260,27 @@ fn why_skipped(dataset: &Dataset, split: Split, available: &[Window]) -> Option<
     }
 }
 
+/// All windows of the set. Errors: those of [`Splits::windows`].
+fn available_windows(evaluation: &EvaluationContext, splits: &Splits) -> Result<Vec<Window>, EvaluationError> {
+    let Inference { loaded, dataset } = evaluation.inference;
+    let (shape, stride) = (window_shape(loaded.spec()), evaluation.config.stride);
+    Ok(splits.windows(dataset, evaluation.split, shape, stride)?)
+}
+
 /// Scores one set; also gives the novelty of its windows, if the model is calibrated.
 fn score_split(
     evaluation: &EvaluationContext,
     splits: &Splits,
     baselines: &Baselines,
 ) -> Result<(SetOutcome, Vec<f64>), EvaluationError> {
-    let (Inference { loaded, dataset }, config) = (evaluation.inference, evaluation.config);
-    let (spec, bootstrap) = (loaded.spec(), config.bootstrap());
-    let available = splits.windows(dataset, evaluation.split, window_shape(spec), config.stride)?;
-    if let Some(reason) = why_skipped(dataset, evaluation.split, &available) {
+    let available = available_windows(evaluation, splits)?;
+    if let Some(reason) = why_skipped(evaluation.inference.dataset, evaluation.split, &available) {
         let reason = reason.to_owned();
         return Ok((SetOutcome::Skipped { reason }, Vec::new()));
     }
-    let windows = evenly(&available, config.max_windows);
-    let windows_scored = score::score(evaluation, &windows, baselines)?;
-    let mut scores = SetScores::new(baselines.methods(), &windows_scored, &bootstrap, is_recording(dataset));
-    if baselines.are_of_benchmark() {
-        metrics::add_benchmark(&mut scores.methods, &windows_scored, spec.pixels());
-    }
+    let windows = evenly(&available, evaluation.config.max_windows);
+    let measured = Measurements::of(evaluation, &windows, baselines)?;
+    let (mut scores, novelty) = measured.scores(evaluation, &windows, baselines);
     scores.windows_available = available.len();
-    if spec.action_inputs().is_some() {
-        let group_of: Vec<usize> = windows_scored.iter().map(|window| window.group).collect();
-        let errors = actions::compare(evaluation, &windows)?;
-        scores.actions = Some(actions::table(&errors, &group_of, &bootstrap));
-        scores.plans = Some(plans::identify(evaluation, &windows)?);
-    }
-    scores.surroundings = surroundings::measure(evaluation, &windows)?;
-    let mut novelty = Vec::new();
-    if let Some(calibration) = &loaded.manifest.calibration {
-        let (measured, found) = uncertainty::measure(evaluation, calibration, &windows)?;
-        scores.uncertainty = Some(measured);
-        novelty = found;
-    }
     Ok((SetOutcome::Scored(Box::new(scores)), novelty))
 }

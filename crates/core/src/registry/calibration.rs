@@ -166,7 +166,7 @@ impl StepErrors {
 }
 
 /// The mean squared error to expect of a predicted frame, intensities 0…1, and its 90 % band.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ExpectedError {
     /// The expected error.
     pub mse: f32,

@@ -10,7 +10,7 @@ mod extend;
 pub mod moving_mnist;
 mod part;
 mod status;
-mod unfinished;
+pub(crate) mod unfinished;
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};

@@ -1,13 +1,15 @@
 //! Turns recordings of real robots into data sets.
 //!
 //! A source (`images`, `donkeycar`, `lerobot`, `numpy`, `npz`, `video` or `bag`) lists its records: time, action, state and where the image
-//! is. `archive` unpacks a source that is one. `timing` cuts them into episodes at one frame rate. `writer` reads the images, resizes them, and writes shards.
+//! is. `archive` unpacks a source that is one. `timing` cuts them into episodes at one frame rate. `encoder` reads the images and
+//! resizes them, `writer` writes shards. `part` saves some of the shards for another process, by `saved_shards`.
 //! Only one shard is in memory at a time.
 
 mod archive;
 mod bag;
 mod camera;
 mod donkeycar;
+mod encoder;
 mod error;
 mod files;
 mod image_files;
@@ -16,15 +18,17 @@ mod lerobot;
 mod npz;
 mod numpy;
 mod options;
+mod part;
 mod raw_images;
 mod recording;
+mod saved_shards;
 mod skipped;
 mod timing;
 mod video;
 mod writer;
 
 use std::collections::BTreeSet;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
 use self::archive::UnpackedSource;
@@ -32,7 +36,12 @@ pub use self::bag::live;
 pub use self::error::ImportError;
 use self::files::{extension, open_file};
 pub use self::options::{DEFAULT_DISK_MIB, DEFAULT_MAX_FILES, ImportConfig, ImportOptions, parse_size};
+#[doc(hidden)]
+pub use self::part::ImportPart;
 use self::recording::Recording;
+use self::saved_shards::SavedShards;
+#[doc(hidden)]
+pub use self::saved_shards::saved_part_shards;
 pub use self::skipped::SkippedItem;
 use self::skipped::listed;
 use self::timing::ImportPlan;
@@ -52,8 +61,19 @@ pub fn import(
     on_progress: &(dyn Fn(ImportProgress) + Sync),
     cancelled: &AtomicBool,
 ) -> Result<Imported, ImportError> {
-    let options = &config.options;
-    options.validate()?;
+    import_parts(config, &[], on_progress, cancelled)
+}
+
+/// As [`import`], but shards that [`import_part`] saved in these directories are taken from there. What is missing there is
+/// imported, so the bytes are the same in every case. Errors: every [`ImportError`].
+#[doc(hidden)]
+pub fn import_parts(
+    config: &ImportConfig,
+    parts: &[PathBuf],
+    on_progress: &(dyn Fn(ImportProgress) + Sync),
+    cancelled: &AtomicBool,
+) -> Result<Imported, ImportError> {
+    config.options.validate()?;
     let directory = writer::Directory::claim(config)?;
     if let Some(finished) = directory.finished()? {
         return Ok(finished);
@@ -61,8 +81,10 @@ pub fn import(
     let write = || {
         // Its images are read while the data set is written.
         let source = UnpackedSource::of(config, cancelled)?;
-        let written =
-            plan(&source.path, config, cancelled).and_then(|plan| directory.write(&plan, on_progress, cancelled));
+        let written = plan(&source.path, config, cancelled).and_then(|plan| {
+            let saved = SavedShards::new(config, &plan, parts);
+            directory.write(&plan, &saved, on_progress, cancelled)
+        });
         written.map_err(|error| source.name_in_archive(error))
     };
     let imported = write();
@@ -70,6 +92,27 @@ pub fn import(
         directory.discard();
     }
     imported
+}
+
+/// Imports a part of a recording, or continues: its share of the shards of the import with the same `config`, in its own directory.
+/// [`import_parts`] then takes them. Errors: every [`ImportError`].
+#[doc(hidden)]
+pub fn import_part(
+    config: &ImportConfig,
+    part: &ImportPart,
+    on_progress: &(dyn Fn(ImportProgress) + Sync),
+    cancelled: &AtomicBool,
+) -> Result<(), ImportError> {
+    config.options.validate()?;
+    // Archives and arrays are unpacked in the part's directory.
+    let here = ImportConfig {
+        out: part.dir.clone(),
+        ..config.clone()
+    };
+    let source = UnpackedSource::of(&here, cancelled)?;
+    let plan = plan(&source.path, &here, cancelled);
+    let written = plan.and_then(|plan| part::write(&plan, config, part, on_progress, cancelled));
+    written.map_err(|error| source.name_in_archive(error))
 }
 
 /// Reads what is to be written. Errors: those of the source, `Option`, `Record`, `Empty`, `Stopped`.

@@ -2,7 +2,9 @@
 //! publishes the next version of its model; an evaluation writes `reports/JOB`.
 
 mod collect;
+mod evaluate;
 mod import;
+mod parts;
 mod sweep;
 mod training_report;
 
@@ -23,18 +25,13 @@ use super::report::JobReporter;
 use super::retry_policy::RetryPolicy;
 use super::spec::AvailableInputs;
 use super::{EvaluateSpec, Job, JobError, JobSpec, JobState, TrainSpec, datasets};
-use crate::store::{JobId, ModelMetrics, Store, StoreError};
-use crate::versions::{VersionError, Versions};
+use crate::store::{JobId, Store, StoreError};
+use crate::versions::Versions;
 use foreframe_core::error_text;
-use foreframe_core::files::remove_dir;
-use foreframe_core::registry::Model;
-use foreframe_core::types::{DatasetName, ModelName, Seed};
+use foreframe_core::types::{DatasetName, ModelName};
 use foreframe_data::dataset::{Dataset, DatasetInfo};
-use foreframe_train::evaluation::{self, EvaluateConfig, EvaluationError};
+use foreframe_train::evaluation;
 use foreframe_train::training::{self, CHECKPOINT_FILE, Training, TrainingEvent};
-
-/// The file of an evaluation's report that is written last.
-const REPORT_FILE: &str = "report.json";
 
 /// What a job can use.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -194,14 +191,6 @@ impl Pipeline {
         }
     }
 
-    /// The version of a model that a job made, if it made one.
-    async fn made_version(&self, job: JobId, model: &ModelName) -> Result<Option<u32>, StoreError> {
-        let row = self.store.job(job).await?;
-        let outcome: Option<Value> = row.and_then(|row| serde_json::from_str(&row.outcome?).ok());
-        let made = outcome.filter(|outcome| outcome["model"] == model.as_str());
-        Ok(made.and_then(|made| u32::try_from(made["version"].as_u64()?).ok()))
-    }
-
     fn train(&self, spec: &TrainSpec, report: &JobReporter, cancelled: &AtomicBool) -> Result<JobResult, JobFailure> {
         let config = spec.config().map_err(|error| failed(&error))?;
         let run = run_key(report.id());
@@ -261,76 +250,6 @@ impl Pipeline {
             return objects.delete(run).await;
         }
         checkpoints::fetch_latest(objects, run).await
-    }
-
-    fn evaluate(
-        &self,
-        spec: &EvaluateSpec,
-        report: &JobReporter,
-        cancelled: &AtomicBool,
-    ) -> Result<JobResult, JobFailure> {
-        let retry = self.retry_policy(report, cancelled);
-        let model = |name: &ModelName, version| retry.run(async || self.model(name, version).await);
-        let version = match (spec.version, spec.after) {
-            (None, Some(after)) => retry.run(async || self.made_version(after, &spec.model).await)?,
-            (version, _) => version,
-        };
-        let loaded = model(&spec.model, version)?;
-        let twin = spec.twin.as_ref().map(|twin| model(twin, None)).transpose()?;
-        report.progress(0, 0, "reading the data set");
-        let dataset = self.dataset(&spec.dataset, self.resources.memory.held_mib(), &retry)?;
-        let config = EvaluateConfig {
-            max_windows: spec.windows,
-            bootstrap_samples: spec.resamples,
-            seed: Seed(spec.seed),
-            twins: twin.iter().collect(),
-            command: request_line(&JobSpec::Evaluate(spec.clone())),
-            cancelled: Some(cancelled),
-            ..EvaluateConfig::default()
-        };
-        let found = evaluation::run(&loaded, &dataset, &config, &|now| {
-            let stage = now.stage.name();
-            report.progress(now.done as u64, now.total as u64, &format!("{} {stage}", now.split));
-        });
-        let mut found = found.map_err(|error| failed(&error))?;
-        let figures = evaluation::draw_figures(&loaded, &dataset, &found).map_err(|error| failed(&error))?;
-        let dir = report_key(report.id());
-        // An earlier attempt may have left an incomplete report.
-        retry.run(async || self.store.objects().delete(&dir).await)?;
-        let out = self.store.objects().data_dir().join(&dir);
-        retry.repeat(|| {
-            // So may a write that failed.
-            let path = out.clone();
-            remove_dir(&out).map_err(|source| EvaluationError::Io { path, source })?;
-            evaluation::prepare(&out)?;
-            evaluation::write(&out, &mut found, &figures)
-        })?;
-        retry.run(async || self.store.objects().push(&dir, REPORT_FILE).await)?;
-        let mut files: Vec<String> = std::fs::read_dir(&out)
-            .map_err(|error| failed(&error))?
-            .filter_map(|entry| entry.ok()?.file_name().into_string().ok())
-            .collect();
-        files.sort();
-        let (version, scores) = (loaded.manifest.version, found.headline());
-        // What models are compared by: the score on other data says something about that data.
-        let is_own = loaded.manifest.dataset.includes(&dataset.info().content_hash);
-        let has_score = loaded.manifest.metrics.get("test").is_some();
-        Ok(JobResult {
-            measured: (is_own || !has_score).then(|| ModelMetrics {
-                model: spec.model.clone(),
-                version,
-                weights_sha256: loaded.manifest.weights_sha256.clone(),
-                metrics: scores.to_string(),
-            }),
-            ..JobResult::of(json!({"model": spec.model, "version": version, "scores": scores, "files": files}))
-        })
-    }
-
-    async fn model(&self, name: &ModelName, version: Option<u32>) -> Result<Model, VersionError> {
-        match version {
-            Some(version) => self.versions.load(name, version).await,
-            None => self.versions.load_active(name).await,
-        }
     }
 
     /// Opens a data set with at most `held_mib` MiB of its frames in memory.

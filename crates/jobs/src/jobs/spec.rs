@@ -1,5 +1,6 @@
 //! The specification of a job, checked when it is submitted, so that mistakes are reported at once.
 
+mod evaluate;
 mod import;
 mod train;
 
@@ -11,6 +12,7 @@ use std::str::FromStr;
 use serde::de::{Error as _, IntoDeserializer as _};
 use serde::{Deserialize, Deserializer, Serialize};
 
+pub use self::evaluate::EvaluateSpec;
 pub use self::import::ImportSpec;
 pub use self::train::TrainSpec;
 use super::JobError;
@@ -18,12 +20,11 @@ use crate::store::JobId;
 use foreframe_core::types::{DatasetName, ModelName, Seed, ValueError};
 use foreframe_data::dataset::{self, CollectConfig, CollectionStatus, DEFAULT_TRIALS_PER_SHARD, DatasetError};
 use foreframe_sim::{RoomSet, Scenario, SimError};
-use foreframe_train::evaluation::EvaluateConfig;
 
 /// The maximum number of trials of one collection.
 pub const MAX_TRIALS: u64 = 1_000_000;
 
-/// The maximum number of parts of one collection.
+/// The maximum number of parts of one job.
 pub const MAX_PARTS: usize = 64;
 
 /// The maximum number of windows of each test set of an evaluation.
@@ -80,43 +81,6 @@ pub struct CollectSpec {
     pub part: Option<usize>,
 }
 
-/// An evaluation: writes a report with figures, which the job's files contain.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
-#[serde(deny_unknown_fields)]
-pub struct EvaluateSpec {
-    /// The model's name.
-    #[serde(deserialize_with = "model")]
-    #[schema(value_type = String)]
-    pub model: ModelName,
-    /// Its version; by default the one that the job of `after` makes, or the active one.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub version: Option<u32>,
-    /// Name of a data set in the data directory.
-    #[serde(deserialize_with = "dataset")]
-    #[schema(value_type = String)]
-    pub dataset: DatasetName,
-    /// A model of the same size without conditioning. The report then shows what the actions are worth.
-    #[serde(default, deserialize_with = "twin", skip_serializing_if = "Option::is_none")]
-    #[schema(value_type = Option<String>)]
-    pub twin: Option<ModelName>,
-    /// The maximum number of windows of each test set, 1 to 100,000.
-    #[serde(default = "default_windows")]
-    #[schema(minimum = 1, maximum = 100_000)]
-    pub windows: usize,
-    /// Bootstrap resamples for the intervals, 100 to 10,000.
-    #[serde(default = "default_resamples")]
-    #[schema(minimum = 100, maximum = 10_000)]
-    pub resamples: usize,
-    /// The random seed of the resamples and of the shuffled actions.
-    #[serde(default)]
-    pub seed: u64,
-    /// Waits until the job with this id has ended, and fails if that has failed. The data set or model that it makes need not
-    /// exist yet.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    #[schema(value_type = Option<String>, pattern = "^job-[0-9]{1,18}$")]
-    pub after: Option<JobId>,
-}
-
 fn default_seed() -> u64 {
     1
 }
@@ -128,14 +92,6 @@ fn default_parts() -> usize {
 #[expect(clippy::trivially_copy_pass_by_ref, reason = "serde calls it with a reference")]
 fn is_one(parts: &usize) -> bool {
     *parts == 1
-}
-
-fn default_windows() -> usize {
-    EvaluateConfig::default().max_windows
-}
-
-fn default_resamples() -> usize {
-    EvaluateConfig::default().bootstrap_samples
 }
 
 /// The data sets and models that jobs can use.
@@ -212,7 +168,8 @@ impl JobSpec {
         match self {
             Self::Train(spec) => spec.parts().into_iter().map(Self::Train).collect(),
             Self::Collect(spec) => spec.parts().into_iter().map(Self::Collect).collect(),
-            Self::Import(_) | Self::Evaluate(_) => Vec::new(),
+            Self::Evaluate(spec) => spec.parts().into_iter().map(Self::Evaluate).collect(),
+            Self::Import(spec) => spec.parts().into_iter().map(Self::Import).collect(),
         }
     }
 
@@ -228,23 +185,6 @@ impl JobSpec {
     }
 }
 
-impl EvaluateSpec {
-    fn check(&self, available: AvailableInputs<'_>) -> Result<(), JobError> {
-        check_dataset(&self.dataset, available.datasets)?;
-        for (field, model) in [("model", Some(&self.model)), ("twin", self.twin.as_ref())] {
-            model.map_or(Ok(()), |model| {
-                check_known((field, "model"), model, available.models.keys())
-            })?;
-        }
-        let versions = available.models.get(&self.model).into_iter().flatten();
-        if let Some(version) = &self.version {
-            check_known(("version", "version"), version, versions)?;
-        }
-        check_range("windows", self.windows, 1..=MAX_WINDOWS)?;
-        check_range("resamples", self.resamples, 100..=MAX_RESAMPLES)
-    }
-}
-
 impl CollectSpec {
     fn check(&self, available: AvailableInputs<'_>) -> Result<(), JobError> {
         if !(1..=MAX_TRIALS).contains(&self.trials) {
@@ -254,11 +194,7 @@ impl CollectSpec {
             );
             return Err(JobError::invalid("trials", reason));
         }
-        check_range("parts", self.parts, 1..=MAX_PARTS)?;
-        if self.part.is_some() {
-            let reason = "only the server makes parts; leave it out, and say how many with parts";
-            return Err(JobError::invalid("part", reason));
-        }
+        check_parts(self.parts, self.part)?;
         let config = self.config(&available.data_dir.join("datasets"))?;
         let is_there = available.datasets.contains(&self.name);
         // With a shared object store, a data set that is complete only here was deleted elsewhere or not yet pushed.
@@ -364,6 +300,16 @@ fn check_known<'a, N: PartialEq + ToString + 'a>(
         name: name.to_string(),
         available: available.map(N::to_string).collect(),
     })
+}
+
+/// Errors: `Invalid` if a job has too many parts, or is submitted as a part.
+fn check_parts(parts: usize, part: Option<usize>) -> Result<(), JobError> {
+    check_range("parts", parts, 1..=MAX_PARTS)?;
+    if part.is_some() {
+        let reason = "only the server makes parts; leave it out, and say how many with parts";
+        return Err(JobError::invalid("part", reason));
+    }
+    Ok(())
 }
 
 fn check_range(field: &'static str, value: usize, range: RangeInclusive<usize>) -> Result<(), JobError> {

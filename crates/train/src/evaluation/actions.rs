@@ -9,7 +9,7 @@ use super::EvaluationError;
 use super::bootstrap::{Bootstrap, Interval, TrialSums};
 use super::inference::{ActionSource, Inference};
 use super::metrics::StepCurve;
-use super::progress::{EvaluationContext, EvaluationStage};
+use super::progress::{EvaluationContext, EvaluationStage, Pass};
 use foreframe_core::error_text::comma_separated;
 use foreframe_core::nn::ModelSpec;
 use foreframe_core::registry::Model;
@@ -139,32 +139,36 @@ pub(super) fn compare(
 ) -> Result<Vec<VariantErrors>, EvaluationError> {
     let (Inference { loaded, dataset }, config) = (evaluation.inference, evaluation.config);
     let donors = shuffle(windows.len(), config.seed).into_iter();
-    let donors: Vec<Window> = donors.map(|donor| windows[donor]).collect();
+    let donors = donors.map(|donor| windows[donor]);
     let own = [Variant::True, Variant::Shuffled, Variant::Held, Variant::Zeroed];
     let mut variants = own.map(|variant| (variant, loaded)).to_vec();
     for twin in &config.twins {
         variants.push((twin_variant(loaded, twin)?, twin));
     }
-    let total = variants.len() * windows.len();
+    let pairs: Vec<(Window, Window)> = windows.iter().copied().zip(donors).collect();
+    let count = variants.len();
     let mut all = Vec::new();
-    for (variant, model) in variants {
+    for (number, (variant, model)) in variants.into_iter().enumerate() {
         let inference = Inference { loaded: model, dataset };
         let window_values = model.spec().horizon * model.spec().pixels();
-        let mut errors = Vec::with_capacity(windows.len());
-        for (batch, donors) in windows.chunks(config.batch).zip(donors.chunks(config.batch)) {
+        let pass = Pass {
+            number,
+            count,
+            ..evaluation.pass(EvaluationStage::Actions)
+        };
+        let errors = evaluation.in_divided_batches(pass, &pairs, |batch| {
+            let (batch, donors): (Vec<Window>, Vec<Window>) = batch.iter().copied().unzip();
             let source = match variant {
-                Variant::Shuffled => ActionSource::OfWindows(donors),
+                Variant::Shuffled => ActionSource::OfWindows(&donors),
                 Variant::Held => ActionSource::Held,
                 Variant::Zeroed => ActionSource::Zero,
                 _ => ActionSource::Recorded,
             };
-            let predicted = inference.predict(batch, source)?.frames;
-            let predicted = predicted.par_chunks_exact(window_values).zip(batch);
+            let predicted = inference.predict(&batch, source)?.frames;
+            let predicted = predicted.par_chunks_exact(window_values).zip(&batch);
             let found = predicted.map(|(frames, &window)| inference.step_errors(window, frames));
-            errors.extend(found.collect::<Result<Vec<_>, EvaluationError>>()?);
-            let done = all.len() * windows.len() + errors.len();
-            evaluation.report(EvaluationStage::Actions, done, total)?;
-        }
+            found.collect::<Result<Vec<_>, EvaluationError>>()
+        })?;
         all.push((variant, errors));
     }
     Ok(all)

@@ -44,12 +44,13 @@ impl Baselines {
     /// window of that shape exists, or none may be `searched`, there are no nearest ones, and where the camera's height or the
     /// commanded speeds are not known there is no geometry. Ego-motion, geometry and cut-out look only at a limited number of
     /// windows or frames, the nearest windows are among at most `searched`, all evenly spread. The validation split serves to
-    /// weigh the nearest windows. Errors: those of [`Splits::windows`] and [`Dataset::pixels`].
+    /// weigh the nearest windows, unless it is `known` how. Errors: those of [`Splits::windows`] and [`Dataset::pixels`].
     pub(super) fn fit(
         dataset: &Dataset,
         splits: &Splits,
         shape: WindowShape,
         searched: usize,
+        known: Option<NearestSummary>,
     ) -> Result<Self, EvaluationError> {
         // None where no window of that shape fits.
         let windows_of = |split, shape| match splits.windows(dataset, split, shape, 1) {
@@ -67,6 +68,7 @@ impl Baselines {
             validation: &windows_of(Split::Validation, shape)?,
             shape,
             searched,
+            known,
         };
         let nearest = NearestWindows::fit(dataset, &sets)?;
         // Every frame that has a successor in the split.
@@ -252,7 +254,7 @@ mod tests {
 
     fn fitted(dataset: &Dataset, searched: usize) -> (Baselines, Splits) {
         let splits = Splits::new(dataset, Seed(1));
-        (Baselines::fit(dataset, &splits, SHAPE, searched).unwrap(), splits)
+        (Baselines::fit(dataset, &splits, SHAPE, searched, None).unwrap(), splits)
     }
 
     fn error_of(method: Method, dataset: &Dataset) -> f64 {
@@ -333,7 +335,7 @@ mod tests {
         let dataset = recordings(SIDE, |_, _| still_scene(), |_, _| 0.0);
         let shape = WindowShape { context: 1, horizon: 1 };
         let splits = Splits::new(&dataset, Seed(1));
-        let baselines = Baselines::fit(&dataset, &splits, shape, usize::MAX).unwrap();
+        let baselines = Baselines::fit(&dataset, &splits, shape, usize::MAX, None).unwrap();
         let inputs = [true_frame(&dataset, 0).unwrap()];
         let window = Window {
             episode: 0,

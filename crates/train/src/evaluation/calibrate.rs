@@ -6,6 +6,7 @@ use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
 use super::config::EvaluateConfig;
+use super::division::Division;
 use super::forecast::{Forecast, contexts, forecasts};
 use super::inference::Inference;
 use super::least_squares::{factor, second_moments, solve};
@@ -54,10 +55,12 @@ pub fn calibrate(
             split_seed: split_seed.0,
         });
     }
+    let division = Division::default();
     let evaluation = |split| EvaluationContext {
         inference: Inference { loaded, dataset },
         split,
         config,
+        division: &division,
         on_progress,
     };
     let spec = loaded.spec();

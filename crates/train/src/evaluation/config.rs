@@ -1,5 +1,6 @@
 //! What an evaluation scores, on what, and how closely.
 
+use std::path::PathBuf;
 use std::sync::atomic::AtomicBool;
 
 use serde::{Deserialize, Serialize};
@@ -89,6 +90,9 @@ pub struct EvaluateConfig<'a> {
     pub twins: Vec<&'a Model>,
     /// Other data sets, which the model's novelty must tell from the scored windows.
     pub novel: Vec<&'a Dataset>,
+    /// Directories in which parts of this evaluation saved their results, which are then not computed again.
+    #[doc(hidden)]
+    pub saved: Vec<PathBuf>,
     /// The command line, for the stamp.
     pub command: String,
     /// Set by another thread to stop the evaluation.
@@ -108,6 +112,7 @@ impl Default for EvaluateConfig<'_> {
             batch: 64,
             twins: Vec::new(),
             novel: Vec::new(),
+            saved: Vec::new(),
             command: String::new(),
             cancelled: None,
         }

@@ -1,5 +1,7 @@
 //! Predictions with what is known of them before the truth is: for the calibration of their errors, and for its test.
 
+use serde::{Deserialize, Serialize};
+
 use super::EvaluationError;
 use super::inference::ActionSource;
 use super::progress::{EvaluationContext, EvaluationStage};
@@ -10,7 +12,7 @@ use foreframe_core::registry::calibration::{
 use foreframe_data::dataset::Window;
 
 /// A predicted window, what was known of it, and its true errors.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub(super) struct Forecast {
     /// How far frames, state and actions are from the training data.
     pub(super) distance: f64,
@@ -30,7 +32,7 @@ pub(super) fn forecasts(
     windows: &[Window],
     calibration: &Calibration,
 ) -> Result<Vec<Forecast>, EvaluationError> {
-    evaluation.in_batches(EvaluationStage::Calibration, windows, |batch| {
+    evaluation.in_divided_batches(evaluation.pass(EvaluationStage::Calibration), windows, |batch| {
         forecast_batch(evaluation, batch, calibration)
     })
 }

@@ -10,7 +10,7 @@ use foreframe_core::frame::quality;
 pub(super) const PSNR_CAP_DB: f64 = 59.0;
 
 /// Scores of one predicted frame against the true one, intensities 0…1.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub(super) struct FrameScore {
     /// Mean squared error per pixel.
     pub(super) mse: f64,
@@ -87,7 +87,7 @@ impl StepCurve {
 }
 
 /// All scores of one window.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub(super) struct WindowScores {
     /// Position of its trial in the data set.
     pub(super) episode: usize,

@@ -9,14 +9,14 @@ use serde::{Deserialize, Serialize};
 use super::EvaluationError;
 use super::bootstrap::{Interval, TrialSums};
 use super::inference::{ActionSource, Inference};
-use super::progress::{EvaluationContext, EvaluationStage};
+use super::progress::{EvaluationContext, EvaluationStage, Pass};
 use super::replay::{action, replayed};
 use super::windows::evenly;
 use foreframe_core::frame::preprocess::scale;
 use foreframe_core::frame::quality;
 use foreframe_core::nn::ModelSpec;
 use foreframe_core::types::Seed;
-use foreframe_data::dataset::Window;
+use foreframe_data::dataset::{Dataset, Window};
 use foreframe_sim::WorldConfig;
 
 /// Plans at each context: the one that was carried out, and those of other windows.
@@ -55,58 +55,84 @@ pub struct PlanIdentification {
 /// The true futures of a context, one for each plan; each `horizon` frames, 0…1. None if the replay differs.
 type Futures = Option<Vec<Vec<f32>>>;
 
-/// Measures a model that takes actions on these windows. Errors: those of the network and the simulator, `Cancelled`.
-pub(super) fn identify(evaluation: &EvaluationContext, windows: &[Window]) -> Result<PlanOutcome, EvaluationError> {
-    let (inference, config) = (evaluation.inference, evaluation.config);
-    let (dataset, spec) = (inference.dataset, inference.spec());
-    let skipped = |reason: &str| {
-        let reason = reason.to_owned();
-        Ok(PlanOutcome::Skipped { reason })
-    };
-    let Some(world) = &dataset.info().world else {
-        return skipped("the data set is a recording, so no other plan can be tried");
-    };
-    if windows.len() < PLANS {
-        return skipped("there are fewer windows than plans to compare");
-    }
+/// The contexts at which plans are compared, with the plans: its own first.
+fn contexts(windows: &[Window], seed: Seed) -> Vec<(Window, Vec<Window>)> {
+    let contexts = (0..).zip(evenly(windows, MAX_CONTEXTS));
+    let contexts = contexts.map(|(index, own)| (own, plans_of(own, windows, seed.derive("plans", index))));
+    contexts.collect()
+}
+
+/// Why plans cannot be compared, if they cannot.
+fn why_skipped(dataset: &Dataset, windows: &[Window]) -> Option<&'static str> {
     let drives = |window: &Window| {
         let trial = dataset.episodes()[window.episode].trial.as_ref();
         trial.is_some_and(|trial| trial.scenario.observer_drives())
     };
-    if !windows.iter().all(drives) {
-        return skipped("the camera stands still in this scenario, whatever the plan");
+    if dataset.info().world.is_none() {
+        return Some("the data set is a recording, so no other plan can be tried");
     }
-    let contexts = evenly(windows, MAX_CONTEXTS);
-    let plans: Vec<Vec<Window>> = (0..)
-        .zip(&contexts)
-        .map(|(index, &own)| plans_of(own, windows, config.seed.derive("plans", index)))
-        .collect();
-    let together = (config.batch / PLANS).max(1);
-    let mut identified = Vec::with_capacity(contexts.len());
-    for (contexts_now, plans) in contexts.chunks(together).zip(plans.chunks(together)) {
-        let futures = contexts_now.par_iter().zip(plans);
-        let futures = futures.map(|(&context, plans)| futures_of(inference, world, context, plans));
+    if windows.len() < PLANS {
+        return Some("there are fewer windows than plans to compare");
+    }
+    (!windows.iter().all(drives)).then_some("the camera stands still in this scenario, whatever the plan")
+}
+
+/// For each context the share of the futures that a model which takes actions identifies; `None` if the simulator does not
+/// reproduce the context, and nothing if plans cannot be compared. Errors: those of the network and the simulator, `Cancelled`.
+pub(super) fn identify(
+    evaluation: &EvaluationContext,
+    windows: &[Window],
+) -> Result<Vec<Option<f64>>, EvaluationError> {
+    let (inference, config) = (evaluation.inference, evaluation.config);
+    let (dataset, spec) = (inference.dataset, inference.spec());
+    let world = dataset.info().world.as_ref();
+    let Some(world) = world.filter(|_| why_skipped(dataset, windows).is_none()) else {
+        return Ok(Vec::new());
+    };
+    let pass = Pass {
+        batch: (config.batch / PLANS).max(1),
+        ..evaluation.pass(EvaluationStage::Plans)
+    };
+    evaluation.in_divided_batches(pass, &contexts(windows, config.seed), |contexts| {
+        let futures = contexts.par_iter();
+        let futures = futures.map(|(context, plans)| futures_of(inference, world, *context, plans));
         let Some(futures) = futures.collect::<Result<Option<Vec<_>>, EvaluationError>>()? else {
-            return skipped("the simulator no longer reproduces the frames of this data set");
+            return Ok(vec![None; contexts.len()]);
         };
-        let repeated: Vec<Window> = contexts_now.iter().flat_map(|&context| [context; PLANS]).collect();
-        let plans = plans.concat();
+        let repeated: Vec<Window> = contexts.iter().flat_map(|&(context, _)| [context; PLANS]).collect();
+        let plans: Vec<Window> = contexts.iter().flat_map(|(_, plans)| plans).copied().collect();
         let predicted = inference.predict(&repeated, ActionSource::OfWindows(&plans))?.frames;
         let predicted = predicted.par_chunks_exact(PLANS * spec.horizon * spec.pixels());
         let shares = predicted.zip(&futures);
-        identified.par_extend(shares.map(|(predicted, futures)| share_identified(spec, predicted, futures)));
-        evaluation.report(EvaluationStage::Plans, identified.len(), contexts.len())?;
+        Ok(shares
+            .map(|(predicted, futures)| Some(share_identified(spec, predicted, futures)))
+            .collect())
+    })
+}
+
+/// The rate over all contexts, from the shares that [`identify`] gives for these windows.
+pub(super) fn outcome(evaluation: &EvaluationContext, windows: &[Window], shares: &[Option<f64>]) -> PlanOutcome {
+    let (dataset, config) = (evaluation.inference.dataset, evaluation.config);
+    let skipped = |reason: &str| PlanOutcome::Skipped {
+        reason: reason.to_owned(),
+    };
+    if let Some(reason) = why_skipped(dataset, windows) {
+        return skipped(reason);
     }
+    let Some(identified) = shares.iter().copied().collect::<Option<Vec<f64>>>() else {
+        return skipped("the simulator no longer reproduces the frames of this data set");
+    };
+    let contexts = evenly(windows, MAX_CONTEXTS);
     let trial_of: Vec<usize> = contexts.iter().map(|context| context.episode).collect();
     let trials = TrialSums::group(&trial_of, identified.iter().map(|&share| [share]));
     let interval = trials.intervals(&config.bootstrap(), <[f64]>::to_vec);
-    Ok(PlanOutcome::Measured(PlanIdentification {
+    PlanOutcome::Measured(PlanIdentification {
         contexts: contexts.len(),
         plans: PLANS,
         rate: trials.means()[0],
         interval: interval.map(|all| all[0]),
         chance: 1.0 / PLANS as f64,
-    }))
+    })
 }
 
 /// The windows whose actions are the plans at a context: its own first, then others drawn at random.

@@ -2,8 +2,12 @@
 
 use std::sync::atomic::Ordering;
 
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+
 use super::EvaluationError;
 use super::config::EvaluateConfig;
+use super::division::Division;
 use super::inference::Inference;
 use foreframe_data::dataset::Window;
 use foreframe_data::dataset::sampler::Split;
@@ -17,8 +21,10 @@ pub enum EvaluationStage {
     Actions,
     /// Plan identification.
     Plans,
-    /// Where movers are, and how far away things are.
+    /// Where movers are.
     Surroundings,
+    /// How far away things are.
+    Depth,
     /// Expected errors and novelty.
     Calibration,
 }
@@ -32,6 +38,7 @@ impl EvaluationStage {
             Self::Actions => "actions",
             Self::Plans => "plans",
             Self::Surroundings => "surroundings",
+            Self::Depth => "depth",
             Self::Calibration => "calibration",
         }
     }
@@ -50,12 +57,25 @@ pub struct EvaluationProgress {
     pub total: usize,
 }
 
+/// A pass over the windows of a set.
+#[derive(Clone, Copy)]
+pub(super) struct Pass {
+    pub(super) stage: EvaluationStage,
+    /// Which pass of its stage, from 0.
+    pub(super) number: usize,
+    /// How many passes its stage has.
+    pub(super) count: usize,
+    /// Windows that are computed together.
+    pub(super) batch: usize,
+}
+
 /// What every pass over windows of a data set needs besides them.
 #[derive(Clone, Copy)]
 pub(super) struct EvaluationContext<'a> {
     pub(super) inference: Inference<'a>,
     pub(super) split: Split,
     pub(super) config: &'a EvaluateConfig<'a>,
+    pub(super) division: &'a Division<'a>,
     pub(super) on_progress: &'a (dyn Fn(EvaluationProgress) + Sync),
 }
 
@@ -87,5 +107,46 @@ impl EvaluationContext<'_> {
             self.report(stage, found.len(), windows.len())?;
         }
         Ok(found)
+    }
+
+    /// A stage of one pass.
+    pub(super) fn pass(&self, stage: EvaluationStage) -> Pass {
+        Pass {
+            stage,
+            number: 0,
+            count: 1,
+            batch: self.config.batch,
+        }
+    }
+
+    /// As [`Self::in_batches`], but what a part has saved is read, and a part computes and gives only the batches of its share.
+    /// `compute` takes a batch of `items`, and may give any number of results for it. Errors: those of `compute`, `Cancelled`,
+    /// `Io` where the results of a part cannot be saved.
+    pub(super) fn in_divided_batches<I, T: Serialize + DeserializeOwned>(
+        &self,
+        pass: Pass,
+        items: &[I],
+        compute: impl Fn(&[I]) -> Result<Vec<T>, EvaluationError>,
+    ) -> Result<Vec<T>, EvaluationError> {
+        let batches: Vec<&[I]> = items.chunks(pass.batch).collect();
+        let share = self.division.share(batches.len());
+        let file = format!("{}-{}-{}", self.split, pass.stage.name(), pass.number);
+        let mut saved = self.division.saved::<T>(&file);
+        let total: usize = batches[share.clone()].iter().map(|batch| batch.len()).sum();
+        let (mut found, mut done, mut is_new) = (Vec::with_capacity(share.len()), 0, false);
+        for index in share.clone() {
+            found.push(if let Some(results) = saved.remove(&index) {
+                results
+            } else {
+                is_new = true;
+                compute(batches[index])?
+            });
+            if is_new && found.len() == share.len() {
+                self.division.save(&file, share.start, &found)?;
+            }
+            done += batches[index].len();
+            self.report(pass.stage, pass.number * total + done, pass.count * total)?;
+        }
+        Ok(found.into_iter().flatten().collect())
     }
 }

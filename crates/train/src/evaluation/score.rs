@@ -28,7 +28,7 @@ struct ModelFrames {
     reconstructed: Vec<f32>,
 }
 
-/// Scores every window. Errors: those of the network, `NotFinite`.
+/// Scores every window. Errors: those of the network, `NotFinite`, `Cancelled`.
 pub(super) fn score(
     evaluation: &EvaluationContext,
     windows: &[Window],
@@ -36,7 +36,7 @@ pub(super) fn score(
 ) -> Result<Vec<WindowScores>, EvaluationError> {
     let inference = evaluation.inference;
     let future = inference.spec().context..window_shape(inference.spec()).frames();
-    evaluation.in_batches(EvaluationStage::Scores, windows, |batch| {
+    evaluation.in_divided_batches(evaluation.pass(EvaluationStage::Scores), windows, |batch| {
         let predicted = inference.predict(batch, ActionSource::Recorded)?;
         let truth = inference.frames(batch, future.clone())?;
         let made = ModelFrames {

@@ -4,8 +4,9 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::EvaluationError;
+use super::inference::Inference;
 use super::metrics::StepCurve;
-use super::progress::{EvaluationContext, EvaluationStage};
+use super::progress::{EvaluationContext, EvaluationStage, Pass};
 use super::replay::replayed;
 use super::windows::evenly;
 use foreframe_core::nn::ModelSpec;
@@ -13,6 +14,8 @@ use foreframe_data::dataset::{DatasetInfo, Window};
 
 /// Contexts at most whose depth is compared, evenly spread over the windows.
 const MAX_DEPTH_CONTEXTS: usize = 60;
+/// Contexts whose depth is compared together.
+const DEPTH_BATCH: usize = 8;
 /// A mover with at least this many pixels in the last frame is visible there.
 const VISIBLE_PIXELS: usize = 8;
 
@@ -59,7 +62,7 @@ pub struct DepthScores {
 }
 
 /// Pixels of one step's masks.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 struct MaskCounts {
     found: usize,
     truth: usize,
@@ -82,6 +85,14 @@ impl MaskCounts {
         }
     }
 
+    fn join(&mut self, other: Self) {
+        self.found += other.found;
+        self.truth += other.truth;
+        self.both += other.both;
+        self.visible += other.visible;
+        self.visible_found += other.visible_found;
+    }
+
     fn score(self) -> MaskScore {
         MaskScore {
             recall: ratio(self.both, self.truth),
@@ -95,58 +106,92 @@ fn ratio(part: usize, whole: usize) -> f64 {
     if whole == 0 { 1.0 } else { part as f64 / whole as f64 }
 }
 
+/// What [`measure`] finds, window by window.
+#[derive(Clone, Debug)]
+pub(super) struct SurroundingsMeasurements {
+    /// For each batch of windows the pixels of each step; `None` without masks.
+    movers: Vec<Option<Vec<MaskCounts>>>,
+    /// For each context the relative errors of all pixels, as estimated and before anything is learned; `None` where the
+    /// simulator cannot tell.
+    depths: Vec<Option<[Vec<f64>; 2]>>,
+}
+
 /// Measures a model on these windows; `None` if it tells nothing of the surroundings. Errors: those of the network and the
 /// simulator, `Cancelled`.
 pub(super) fn measure(
     evaluation: &EvaluationContext,
     windows: &[Window],
-) -> Result<Option<SurroundingsScores>, EvaluationError> {
+) -> Result<Option<SurroundingsMeasurements>, EvaluationError> {
     let flow = evaluation.inference.spec().flow();
     if !flow.is_some_and(|flow| flow.layers.depth) {
         return Ok(None);
     }
-    Ok(Some(SurroundingsScores {
+    Ok(Some(SurroundingsMeasurements {
         movers: movers(evaluation, windows)?,
-        depth: depth(evaluation, windows)?,
+        depths: depths(evaluation, windows)?,
     }))
 }
 
-fn movers(evaluation: &EvaluationContext, windows: &[Window]) -> Result<Option<MoverScores>, EvaluationError> {
-    let (inference, spec) = (evaluation.inference, evaluation.inference.spec());
-    let dataset = inference.dataset;
-    let (info, pixels) = (dataset.info(), spec.pixels());
-    if !info.has_masks || !has_size_of(info, spec) {
-        return Ok(None);
-    }
-    let mut counts = vec![MaskCounts::default(); 1 + spec.horizon];
-    let mut done = 0;
-    for batch in windows.chunks(evaluation.config.batch) {
-        let Some(logits) = inference.movers(batch)? else {
-            return Ok(None);
-        };
-        for (window, logits) in batch.iter().zip(logits.chunks_exact(counts.len() * pixels)) {
-            let last = window.first_frame + spec.context - 1;
-            let mut seen = [false; 256];
-            for (step, (counts, logits)) in counts.iter_mut().zip(logits.chunks_exact(pixels)).enumerate() {
-                let Some(mask) = dataset.mask(last + step)? else {
-                    return Ok(None);
-                };
-                if step == 0 {
-                    seen = visible(&mask);
-                }
-                counts.add(logits, &mask, &seen);
-            }
+impl SurroundingsMeasurements {
+    /// The scores of all windows.
+    pub(super) fn scores(self) -> SurroundingsScores {
+        SurroundingsScores {
+            movers: mover_scores(self.movers),
+            depth: depth_scores(self.depths),
         }
-        done += batch.len();
-        evaluation.report(EvaluationStage::Surroundings, done, windows.len())?;
+    }
+}
+
+/// Nothing for a model that does not find movers.
+fn movers(evaluation: &EvaluationContext, windows: &[Window]) -> Result<Vec<Option<Vec<MaskCounts>>>, EvaluationError> {
+    let (inference, spec) = (evaluation.inference, evaluation.inference.spec());
+    let info = inference.dataset.info();
+    let finds_movers = spec.flow().is_some_and(|flow| flow.layers.movers);
+    if !finds_movers || !info.has_masks || !has_size_of(info, spec) {
+        return Ok(Vec::new());
+    }
+    let pass = evaluation.pass(EvaluationStage::Surroundings);
+    evaluation.in_divided_batches(pass, windows, |batch| Ok(vec![count_masks(inference, batch)?]))
+}
+
+/// The pixels of each step's masks, over all windows of a batch.
+fn count_masks(inference: Inference, batch: &[Window]) -> Result<Option<Vec<MaskCounts>>, EvaluationError> {
+    let (spec, pixels) = (inference.spec(), inference.spec().pixels());
+    let mut counts = vec![MaskCounts::default(); 1 + spec.horizon];
+    let Some(logits) = inference.movers(batch)? else {
+        return Ok(None);
+    };
+    for (window, logits) in batch.iter().zip(logits.chunks_exact(counts.len() * pixels)) {
+        let last = window.first_frame + spec.context - 1;
+        let mut seen = [false; 256];
+        for (step, (counts, logits)) in counts.iter_mut().zip(logits.chunks_exact(pixels)).enumerate() {
+            let Some(mask) = inference.dataset.mask(last + step)? else {
+                return Ok(None);
+            };
+            if step == 0 {
+                seen = visible(&mask);
+            }
+            counts.add(logits, &mask, &seen);
+        }
+    }
+    Ok(Some(counts))
+}
+
+fn mover_scores(batches: Vec<Option<Vec<MaskCounts>>>) -> Option<MoverScores> {
+    let batches = batches.into_iter().collect::<Option<Vec<_>>>()?;
+    let mut counts = vec![MaskCounts::default(); batches.first()?.len()];
+    for batch in batches {
+        for (sum, counts) in counts.iter_mut().zip(batch) {
+            sum.join(counts);
+        }
     }
     let curve = |of: fn(MaskCounts) -> f64| StepCurve::new(counts.iter().skip(1).map(|&counts| of(counts)).collect());
-    Ok(Some(MoverScores {
+    Some(MoverScores {
         now: counts[0].score(),
         recall: curve(|counts| counts.score().recall),
         recall_of_visible: curve(|counts| ratio(counts.visible_found, counts.visible)),
         iou: curve(|counts| counts.score().iou),
-    }))
+    })
 }
 
 /// Whether frames need no resizing, which masks and depths do not get.
@@ -163,15 +208,15 @@ fn visible(mask: &[u8]) -> [bool; 256] {
     pixels.map(|count| count >= VISIBLE_PIXELS)
 }
 
-fn depth(evaluation: &EvaluationContext, windows: &[Window]) -> Result<Option<DepthScores>, EvaluationError> {
+/// Nothing where the simulator cannot tell.
+fn depths(evaluation: &EvaluationContext, windows: &[Window]) -> Result<Vec<Option<[Vec<f64>; 2]>>, EvaluationError> {
     let inference = evaluation.inference;
     let (dataset, spec) = (inference.dataset, inference.spec());
     let is_same_size = has_size_of(dataset.info(), spec);
     let Some(world) = dataset.info().world.as_ref().filter(|_| is_same_size) else {
-        return Ok(None);
+        return Ok(Vec::new());
     };
-    let contexts = evenly(windows, MAX_DEPTH_CONTEXTS);
-    let errors = contexts.par_iter().map(|&window| -> Result<_, EvaluationError> {
+    let errors = |&window: &Window| -> Result<_, EvaluationError> {
         let Some(replay) = replayed(inference, world, window)? else {
             return Ok(None);
         };
@@ -190,20 +235,28 @@ fn depth(evaluation: &EvaluationContext, windows: &[Window]) -> Result<Option<De
                 .collect()
         };
         Ok(Some([relative(&estimated), relative(&before)]))
-    });
-    let Some(errors) = errors.collect::<Result<Option<Vec<[Vec<f64>; 2]>>, EvaluationError>>()? else {
-        return Ok(None);
     };
+    let pass = Pass {
+        batch: DEPTH_BATCH,
+        ..evaluation.pass(EvaluationStage::Depth)
+    };
+    evaluation.in_divided_batches(pass, &evenly(windows, MAX_DEPTH_CONTEXTS), |batch| {
+        batch.par_iter().map(errors).collect()
+    })
+}
+
+fn depth_scores(errors: Vec<Option<[Vec<f64>; 2]>>) -> Option<DepthScores> {
+    let errors = errors.into_iter().collect::<Option<Vec<_>>>()?;
     let median = |which: usize| {
         let mut all: Vec<f64> = errors.iter().flat_map(|errors| &errors[which]).copied().collect();
         all.sort_by(f64::total_cmp);
         all.get(all.len() / 2).copied().unwrap_or(f64::NAN)
     };
-    Ok(Some(DepthScores {
-        frames: contexts.len(),
+    (!errors.is_empty()).then(|| DepthScores {
+        frames: errors.len(),
         median_relative_error: median(0),
         before_learning: median(1),
-    }))
+    })
 }
 
 #[cfg(test)]

@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 
 use super::EvaluationError;
 use super::compatible::has_states_of;
-use super::forecast::{Forecast, contexts, forecasts};
+use super::forecast::{Forecast, contexts};
 use super::metrics::StepCurve;
 use super::progress::EvaluationContext;
 use super::statistics::quantile;
@@ -46,13 +46,8 @@ pub struct NoveltyScores {
     pub auroc: f64,
 }
 
-/// Scores the calibration on these windows; also gives their novelty. Errors: those of the network, `Cancelled`.
-pub(super) fn measure(
-    evaluation: &EvaluationContext,
-    calibration: &Calibration,
-    windows: &[Window],
-) -> Result<(UncertaintyScores, Vec<f64>), EvaluationError> {
-    let found = forecasts(evaluation, windows, calibration)?;
+/// Scores the calibration on these forecasts; also gives their novelty.
+pub(super) fn scores(calibration: &Calibration, found: &[Forecast]) -> (UncertaintyScores, Vec<f64>) {
     let novelty_of = |distance| f64::from(calibration.novelty.novelty(distance));
     let novelty: Vec<f64> = found.iter().map(|forecast| novelty_of(forecast.distance)).collect();
     let from_start = found.iter().filter_map(|forecast| forecast.distance_from_start);
@@ -60,19 +55,19 @@ pub(super) fn measure(
     let steps = calibration.steps.len();
     let curve = |of: &dyn Fn(usize) -> f64| StepCurve::new((0..steps).map(of).collect());
     let scores = UncertaintyScores {
-        coverage: StepCurve::mean_over(&found, steps, |forecast, step| f64::from(is_inside(forecast, step))),
-        width: StepCurve::mean_over(&found, steps, |forecast, step| {
+        coverage: StepCurve::mean_over(found, steps, |forecast, step| f64::from(is_inside(forecast, step))),
+        width: StepCurve::mean_over(found, steps, |forecast, step| {
             f64::from(forecast.expected[step].high - forecast.expected[step].low)
         }),
         constant_width: curve(&|step| {
             let errors: Vec<f64> = found.iter().map(|forecast| forecast.errors[step]).collect();
             quantile(errors.clone(), 0.95) - quantile(errors, 0.05)
         }),
-        correlation: curve(&|step| correlation(&found, step)),
+        correlation: curve(&|step| correlation(found, step)),
         novelty: mean(&novelty),
         wrong_origin_auroc: (!from_start.is_empty()).then(|| auroc(&novelty, &from_start)),
     };
-    Ok((scores, novelty))
+    (scores, novelty)
 }
 
 fn mean(values: &[f64]) -> f64 {

@@ -38,7 +38,7 @@ pub(crate) fn save(
 
 /// The saved trials of a shard. None if the file is missing or damaged: they are simulated again.
 pub(crate) fn load(info: &DatasetInfo, out: &Path, shard: usize) -> Vec<EncodedEpisode> {
-    read(info, &path(out, shard)).unwrap_or_default()
+    read(info, out, shard).unwrap_or_default()
 }
 
 /// How many trials of these shards are saved.
@@ -74,7 +74,9 @@ pub(crate) fn remove_all(out: &Path) -> Result<(), DatasetError> {
     }
 }
 
-fn read(info: &DatasetInfo, path: &Path) -> Result<Vec<EncodedEpisode>, DatasetError> {
+/// The saved episodes of a shard. Errors: `Io`, `Corrupt`.
+pub(crate) fn read(info: &DatasetInfo, out: &Path, shard: usize) -> Result<Vec<EncodedEpisode>, DatasetError> {
+    let path = &path(out, shard);
     let mut rows = Rows::default();
     for batch in &batches(path)? {
         let column = Column { batch, path };

@@ -1,5 +1,7 @@
 //! What an import leaves out: damaged lines, messages and images.
 
+use std::path::Path;
+
 use serde::{Deserialize, Serialize};
 
 /// How many items are listed; more are only counted, so that a recording with endless damage needs little memory.
@@ -62,7 +64,7 @@ pub(super) fn listed(names: impl IntoIterator<Item = impl AsRef<str>>) -> String
 }
 
 /// What was left out, in the order in which it was found.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct SkippedList {
     items: Vec<SkippedItem>,
     /// Items that are not listed.
@@ -83,6 +85,19 @@ impl SkippedList {
             self.push(item);
         }
         self.more += other.more;
+    }
+
+    /// The same with another path instead of one that the items name.
+    pub(super) fn moved(mut self, from: &Path, to: &Path) -> Self {
+        let [from, to] = [from, to].map(|path| path.display().to_string());
+        for text in self
+            .items
+            .iter_mut()
+            .flat_map(|item| [&mut item.place, &mut item.reason])
+        {
+            *text = text.replace(&from, &to);
+        }
+        self
     }
 
     /// The first item.

@@ -3,28 +3,23 @@
 
 use std::fs::{self, File};
 use std::io::ErrorKind;
-use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use serde::Serialize;
 
-use super::recording::{Record, Recording};
-use super::skipped::{MAX_ITEMS, SkippedItem, SkippedList};
+use super::encoder::{EncodedShard, EpisodeEncoder};
+use super::saved_shards::SavedShards;
+use super::skipped::{MAX_ITEMS, SkippedItem};
 use super::timing::ImportPlan;
 use super::{ImportConfig, ImportError, ImportOptions};
-use crate::dataset::info::{DatasetInfo, EpisodeData};
+use crate::dataset::info::DatasetInfo;
 use crate::dataset::store::arguments::lock_file;
 use crate::dataset::store::files::{is_unused, write_atomically};
 use crate::dataset::store::layout::{DatasetMetadata, IMPORT_ARGUMENTS, INFO, shard_path};
-use crate::dataset::store::shard::EncodedEpisode;
 use crate::dataset::store::writer::{ShardWriter, shard_ranges};
 use foreframe_core::files::{none_if_missing, remove_partials};
-use foreframe_core::frame::Frame;
-use foreframe_core::frame::resize::resize;
 
-/// Images that are decoded in parallel.
-const CHUNK_FRAMES: usize = 256;
 /// What was left out, with the shard in which it would have been; without one, if the source's lists show it.
 const SKIPPED: &str = "meta/skipped.json";
 
@@ -172,10 +167,11 @@ impl<'a> Directory<'a> {
         }
     }
 
-    /// Writes the shards that are missing, then the tables. Errors: `Cancelled`, `Image`, `Record`, `Io`, `Dataset`.
+    /// Writes the shards that are missing, then the tables. Shards that parts saved are not read from the source again. Errors: `Cancelled`, `Image`, `Record`, `Io`, `Dataset`.
     pub(super) fn write(
         &self,
         plan: &ImportPlan,
+        saved: &SavedShards,
         on_progress: &(dyn Fn(ImportProgress) + Sync),
         cancelled: &AtomicBool,
     ) -> Result<Imported, ImportError> {
@@ -193,17 +189,21 @@ impl<'a> Directory<'a> {
             if !writer.resume(None) {
                 let shard = writer.shard_count();
                 skipped.retain(|(of, _)| *of != Some(shard));
-                let encoder = EpisodeEncoder {
-                    plan,
-                    options: &self.config.options,
-                    writer: &writer,
-                };
                 let on_frames = |frames: usize| {
                     let done = done + frames as u64;
                     on_progress(ImportProgress { done, total });
                 };
-                let encoded = encoder.encode(episodes, cancelled, &on_frames);
-                let (encoded, bad) = encoded.map_err(|error| match error {
+                let encoded = match saved.shard(writer.info(), shard) {
+                    Some(saved) => Ok(saved),
+                    None => EpisodeEncoder {
+                        plan,
+                        options: &self.config.options,
+                        info: writer.info(),
+                        first: writer.episode_count(),
+                    }
+                    .encode(episodes, cancelled, &on_frames),
+                };
+                let EncodedShard { encoded, bad } = encoded.map_err(|error| match error {
                     ImportError::Stopped => ImportError::Cancelled { done, total },
                     other => other,
                 })?;
@@ -245,7 +245,7 @@ pub fn saved_shards(out: &Path) -> usize {
         .count()
 }
 
-fn description(config: &ImportConfig, plan: &ImportPlan) -> DatasetInfo {
+pub(super) fn description(config: &ImportConfig, plan: &ImportPlan) -> DatasetInfo {
     // The name under which users find it; the source's own if the directory has none, as `..` has not.
     let directory = config.out.file_name();
     DatasetInfo {
@@ -260,66 +260,5 @@ fn description(config: &ImportConfig, plan: &ImportPlan) -> DatasetInfo {
         state_channels: plan.recording.state_channels.clone(),
         camera: plan.recording.camera,
         ..DatasetInfo::default()
-    }
-}
-
-/// Makes the episodes of the next shard.
-struct EpisodeEncoder<'a> {
-    plan: &'a ImportPlan,
-    options: &'a ImportOptions,
-    writer: &'a ShardWriter,
-}
-
-impl EpisodeEncoder<'_> {
-    /// Reads and compresses the images of some episodes. A damaged image ends its episode if it may be left out. Errors: those of
-    /// the images, `Stopped`, `Dataset`.
-    fn encode(
-        &self,
-        episodes: Range<usize>,
-        cancelled: &AtomicBool,
-        on_frames: &dyn Fn(usize),
-    ) -> Result<(Vec<EncodedEpisode>, SkippedList), ImportError> {
-        let Recording { records, images, .. } = &self.plan.recording;
-        let (mut encoded, mut bad, mut count) = (Vec::new(), SkippedList::default(), 0);
-        let resize = |image: &Frame, place: &str| {
-            let (width, height) = (self.options.frame_width_px, self.options.frame_height_px);
-            resize(image, width, height, self.options.resize).map_err(ImportError::image(place, place))
-        };
-        for episode in &self.plan.episodes[episodes] {
-            let mut data = EpisodeData::default();
-            for chunk in episode.chunks(CHUNK_FRAMES) {
-                let wanted: Vec<&Record> = chunk.iter().map(|frame| &records[frame.record]).collect();
-                let frames = images.read_all(&wanted, &resize, cancelled);
-                for ((planned, record), frame) in chunk.iter().zip(wanted).zip(frames) {
-                    match frame {
-                        Ok(frame) => {
-                            data.timestamps_s.push(record.timestamp_s);
-                            data.pixels.extend_from_slice(frame.pixels());
-                            data.actions.extend_from_slice(&planned.action);
-                            data.states.extend_from_slice(&record.state);
-                        }
-                        Err(error) => {
-                            error.leave_out(self.options.skip_bad, &mut bad)?;
-                            self.close(&mut data, &mut encoded)?;
-                        }
-                    }
-                }
-                count += chunk.len();
-                on_frames(count);
-            }
-            self.close(&mut data, &mut encoded)?;
-        }
-        Ok((encoded, bad))
-    }
-
-    /// Ends an episode; one of a single frame is of no use and left out. Its times count from its start.
-    fn close(&self, data: &mut EpisodeData, encoded: &mut Vec<EncodedEpisode>) -> Result<(), ImportError> {
-        let mut data = std::mem::take(data);
-        if let [start_s, _, ..] = data.timestamps_s[..] {
-            data.timestamps_s.iter_mut().for_each(|time_s| *time_s -= start_s);
-            let episode = self.writer.episode_count() + encoded.len();
-            encoded.push(EncodedEpisode::new(self.writer.info(), episode, data)?);
-        }
-        Ok(())
     }
 }

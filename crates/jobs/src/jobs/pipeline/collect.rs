@@ -5,12 +5,11 @@ use std::ops::Range;
 use std::sync::atomic::AtomicBool;
 
 use serde_json::json;
-use tracing::warn;
 
 use super::super::executor::{JobFailure, JobResult};
 use super::super::report::JobReporter;
 use super::super::retry_policy::RetryPolicy;
-use super::super::{CollectSpec, JobState, datasets};
+use super::super::{CollectSpec, datasets};
 use super::{Pipeline, failed, run_key};
 use crate::store::JobRow;
 use foreframe_data::dataset::{self, CollectConfig, CollectionStatus, DatasetError};
@@ -38,7 +37,7 @@ impl Pipeline {
             _ => false,
         };
         retry.run(async || datasets::clear_stale(self.store.objects(), &spec.name, is_stale).await)?;
-        let parts = retry.run(async || self.store.parts(report.id()).await)?;
+        let parts = self.ended_parts(report, &retry)?;
         self.take_parts(&config, &parts, report, &retry)?;
         // Whole shards are saved; a new attempt continues after them.
         if let Ok(CollectionStatus::Unfinished { trials }) = CollectionStatus::of(&config) {
@@ -48,9 +47,7 @@ impl Pipeline {
         // After an error it continues with the shards that are finished.
         let info = retry.repeat_once_free(|| dataset::collect(&config, &on_progress, cancelled))?;
         let made = self.finish_dataset(&spec.name, &info, &retry)?;
-        for part in &parts {
-            retry.run(async || self.store.objects().delete(&run_key(part.id)).await)?;
-        }
+        self.delete_parts(&parts, &retry)?;
         Ok(JobResult::of(made))
     }
 
@@ -77,17 +74,11 @@ impl Pipeline {
         retry.repeat_once_free(|| {
             dataset::collect_part(&config, shards.clone(), &on_progress, &on_saved, retry.cancelled)
         })?;
-        retry.run(async || objects.push(&run, LAST_FILE).await)?;
-        if objects.are_shared()
-            && let Err(error) = std::fs::remove_dir_all(&config.out)
-        {
-            warn!(job.id = %report.id(), %error, "could not delete this worker's copy of a part");
-        }
+        self.push_part(LAST_FILE, report, retry)?;
         Ok(JobResult::of(json!({"shards": [shards.start, shards.end]})))
     }
 
     /// Takes over the trials that the parts simulated. What is missing is simulated by this job.
-    /// Errors: `Failed` if a part did not succeed.
     fn take_parts(
         &self,
         config: &CollectConfig,
@@ -95,25 +86,11 @@ impl Pipeline {
         report: &JobReporter,
         retry: &RetryPolicy<'_>,
     ) -> Result<(), JobFailure> {
-        if let Some(part) = parts.iter().find(|part| part.state != JobState::Succeeded.name()) {
-            let reason = part.error.as_deref().unwrap_or("resume this job to collect it");
-            return Err(JobFailure::Failed(format!(
-                "its part {} is {}: {reason}",
-                part.id, part.state
-            )));
-        }
         if parts.is_empty() {
             return Ok(());
         }
         report.progress(0, config.trials, "joining the parts");
-        let objects = self.store.objects();
-        for part in parts {
-            retry.run(async || objects.pull(&run_key(part.id), LAST_FILE).await)?;
-        }
-        let dirs: Vec<_> = parts
-            .iter()
-            .map(|part| objects.data_dir().join(run_key(part.id)))
-            .collect();
+        let dirs = self.fetch_parts(parts, LAST_FILE, retry)?;
         retry.repeat_once_free(|| dataset::take_parts(config, &dirs))
     }
 }

@@ -1,14 +1,20 @@
-//! The work of an import.
+//! The work of an import. A part of one saves its shards in `runs/JOB`, from where the whole takes them. What a part did not save
+//! is imported by the whole.
 
 use std::sync::atomic::AtomicBool;
 
 use super::super::datasets;
 use super::super::report::JobReporter;
+use super::super::retry_policy::RetryPolicy;
 use super::super::spec::ImportSpec;
-use super::{Pipeline, failed};
+use super::parts::LAST_FILE;
+use super::{Pipeline, failed, run_key};
 use crate::jobs::executor::{JobFailure, JobResult};
 use foreframe_data::dataset::IMPORT_ARGUMENTS;
-use foreframe_data::dataset::import::{ImportError, ImportProgress, Imported, check_out, import, saved_shards};
+use foreframe_data::dataset::import::{
+    ImportConfig, ImportError, ImportPart, ImportProgress, Imported, check_out, import_part, import_parts,
+    saved_part_shards, saved_shards,
+};
 
 /// How many left-out items are written to the job's log; `meta/skipped.json` lists up to 10,000.
 const LOGGED_ITEMS: usize = 200;
@@ -46,6 +52,15 @@ impl Pipeline {
         config.max_files = self.resources.max_import_files;
         report.progress(0, 0, "reading the recording");
         let retry = self.retry_policy(report, cancelled);
+        if let Some(index) = spec.part {
+            let part = ImportPart {
+                dir: data_dir.join(run_key(report.id())),
+                index,
+                count: spec.parts,
+            };
+            return self.import_part(&config, &part, &retry);
+        }
+        let parts = self.ended_parts(report, &retry)?;
         let is_stale = |was_deleted| {
             let is_of_another_import = config.out.join(IMPORT_ARGUMENTS).is_file();
             matches!(check_out(&config), Err(ImportError::OutExists { .. })) && (was_deleted || is_of_another_import)
@@ -55,12 +70,32 @@ impl Pipeline {
         report.checkpoint(saved_shards(&config.out) as u64);
         let on_progress = |now: ImportProgress| report.progress(now.done, now.total, "importing");
         // After an error it continues with the shards that are finished.
-        let imported = retry.repeat_once_free(|| import(&config, &on_progress, cancelled))?;
+        let dirs = self.fetch_parts(&parts, LAST_FILE, &retry)?;
+        let imported = retry.repeat_once_free(|| import_parts(&config, &dirs, &on_progress, cancelled))?;
         imported.notes.iter().for_each(|note| report.line(note.clone()));
         log_skipped(&imported, report);
         let mut result = self.finish_dataset(&spec.name, &imported.info, &retry)?;
         result["skipped"] = imported.skipped_count().into();
+        self.delete_parts(&parts, &retry)?;
         Ok(JobResult::of(result))
+    }
+
+    /// Imports a part's share of the shards.
+    fn import_part(
+        &self,
+        config: &ImportConfig,
+        part: &ImportPart,
+        retry: &RetryPolicy<'_>,
+    ) -> Result<JobResult, JobFailure> {
+        let report = retry.report;
+        self.prepare_part(report, retry)?;
+        report.checkpoint(saved_part_shards(&part.dir) as u64);
+        let on_progress = |now: ImportProgress| {
+            report.progress(now.done, now.total, "importing");
+            report.checkpoint(saved_part_shards(&part.dir) as u64);
+        };
+        retry.repeat_once_free(|| import_part(config, part, &on_progress, retry.cancelled))?;
+        self.finish_part((part.index, part.count), report, retry)
     }
 }
 

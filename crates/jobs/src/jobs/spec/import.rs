@@ -7,7 +7,7 @@ use std::path::{Component, Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use super::{AvailableInputs, name};
+use super::{AvailableInputs, check_parts, default_parts, is_one, name};
 use crate::jobs::JobError;
 use crate::jobs::uploads::UploadedFile;
 use foreframe_core::error_text;
@@ -88,6 +88,15 @@ pub struct ImportSpec {
     /// Imports the records of a Donkeycar tub that are marked as deleted, too.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub include_deleted: bool,
+    /// In how many parts workers may import it, 1 to 64: each takes its share of the frames, in shards of about 2000. The data set
+    /// has the same bytes however many there are. Parts without a shard have nothing to do.
+    #[serde(default = "default_parts", skip_serializing_if = "is_one")]
+    #[schema(minimum = 1, maximum = 64, default = 1)]
+    pub parts: usize,
+    /// Which of the parts this job imports, from 0. Only jobs that are parts have it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schema(read_only)]
+    pub part: Option<usize>,
 }
 
 fn default_size() -> String {
@@ -109,6 +118,7 @@ fn default_hold() -> f64 {
 
 impl ImportSpec {
     pub(super) fn check(&self, available: AvailableInputs<'_>) -> Result<(), JobError> {
+        check_parts(self.parts, self.part)?;
         let config = self.config(available.data_dir, available.import_dir)?;
         if available.datasets.contains(&self.name) {
             return Err(JobError::taken(&self.name, "exists; choose another name"));
@@ -124,6 +134,18 @@ impl ImportSpec {
             ),
             other => JobError::invalid("source", error_text::with_causes(&other)),
         })
+    }
+
+    /// Its parts; none if it is imported as a whole. How many shards there are is known when the recording is read.
+    pub(super) fn parts(&self) -> Vec<Self> {
+        if self.parts < 2 || self.part.is_some() {
+            return Vec::new();
+        }
+        let part = |part| Self {
+            part: Some(part),
+            ..self.clone()
+        };
+        (0..self.parts).map(part).collect()
     }
 
     /// The uploaded file that is the source, if it is one. Errors: `Invalid`.

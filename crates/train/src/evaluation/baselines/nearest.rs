@@ -28,6 +28,8 @@ pub(super) struct WindowSets<'a> {
     pub(super) shape: WindowShape,
     /// Training windows that are searched at most.
     pub(super) searched: usize,
+    /// What was chosen for the same windows before.
+    pub(super) known: Option<NearestSummary>,
 }
 
 /// The baseline with its training windows.
@@ -44,30 +46,10 @@ impl NearestWindows {
         let Some(windows) = TrainingWindows::new(dataset, kept, sets.shape)? else {
             return Ok(None);
         };
-        let validation = evenly(sets.validation, MAX_VALIDATION_WINDOWS);
-        let mut summary = NearestSummary {
-            searched: windows.len(),
-            available: sets.training.len(),
-            validation_windows: validation.len(),
-            exponent: 1.0,
-            action_weight: 0.0,
+        let summary = match sets.known {
+            Some(known) => known,
+            None => choose(dataset, &windows, sets)?,
         };
-        let action_weights = if windows.has_actions() {
-            &ACTION_WEIGHTS[..]
-        } else {
-            &[0.0]
-        };
-        let errors = validation_errors(dataset, &windows, &validation, action_weights)?;
-        let mut least = f64::INFINITY;
-        for (&action_weight, errors) in action_weights.iter().zip(errors) {
-            for (exponent, error) in EXPONENTS.into_iter().zip(errors) {
-                // Without a validation window no error is known.
-                if error < least && !validation.is_empty() {
-                    least = error;
-                    (summary.exponent, summary.action_weight) = (exponent, action_weight);
-                }
-            }
-        }
         Ok(Some(Self { windows, summary }))
     }
 
@@ -91,6 +73,35 @@ impl NearestWindows {
         let steps = (first..first + horizon).map(|step| Ok(mean(&frames_at(dataset, &neighbours, step)?, &weights)));
         steps.collect()
     }
+}
+
+/// Chooses the weights by the MSE on validation windows. Errors: those of [`Dataset::pixels`].
+fn choose(dataset: &Dataset, windows: &TrainingWindows, sets: &WindowSets) -> Result<NearestSummary, EvaluationError> {
+    let validation = evenly(sets.validation, MAX_VALIDATION_WINDOWS);
+    let mut summary = NearestSummary {
+        searched: windows.len(),
+        available: sets.training.len(),
+        validation_windows: validation.len(),
+        exponent: 1.0,
+        action_weight: 0.0,
+    };
+    let action_weights = if windows.has_actions() {
+        &ACTION_WEIGHTS[..]
+    } else {
+        &[0.0]
+    };
+    let errors = validation_errors(dataset, windows, &validation, action_weights)?;
+    let mut least = f64::INFINITY;
+    for (&action_weight, errors) in action_weights.iter().zip(errors) {
+        for (exponent, error) in EXPONENTS.into_iter().zip(errors) {
+            // Without a validation window no error is known.
+            if error < least && !validation.is_empty() {
+                least = error;
+                (summary.exponent, summary.action_weight) = (exponent, action_weight);
+            }
+        }
+    }
+    Ok(summary)
 }
 
 /// The sum of the MSE over validation windows and steps, for each weight of the actions and each of [`EXPONENTS`]. Errors:
@@ -287,6 +298,7 @@ mod tests {
             validation: &windows[half + SHAPE.frames()..],
             shape: SHAPE,
             searched: usize::MAX,
+            known: None,
         };
         NearestWindows::fit(dataset, &sets).unwrap().unwrap()
     }

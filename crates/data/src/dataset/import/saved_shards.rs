@@ -1,0 +1,106 @@
+//! The shards that the parts of an import saved, each with what was left out of it.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
+
+use super::encoder::EncodedShard;
+use super::skipped::SkippedList;
+use super::timing::ImportPlan;
+use super::{ImportConfig, ImportError};
+use crate::dataset::collect::unfinished;
+use crate::dataset::info::DatasetInfo;
+use crate::dataset::store::files::write_atomically;
+
+/// What is saved of a shard besides its episodes, and after them.
+#[derive(Serialize, Deserialize)]
+struct SavedShard {
+    /// The hash of the plan to which it belongs.
+    plan: String,
+    bad: SkippedList,
+}
+
+/// The shards that parts saved.
+pub(super) struct SavedShards<'a> {
+    plan: String,
+    dirs: &'a [PathBuf],
+}
+
+impl<'a> SavedShards<'a> {
+    /// Those in these directories that belong to a plan.
+    pub(super) fn new(config: &ImportConfig, plan: &ImportPlan, dirs: &'a [PathBuf]) -> Self {
+        let plan = hash(config, plan);
+        Self { plan, dirs }
+    }
+
+    /// A shard, unless it is missing, damaged or of another plan.
+    pub(super) fn shard(&self, info: &DatasetInfo, shard: usize) -> Option<EncodedShard> {
+        let mut found = self.dirs.iter().map(|dir| (dir, saved_shard(dir, shard)));
+        let (dir, saved) =
+            found.find_map(|(dir, saved)| Some((dir, saved.filter(|saved| saved.plan == self.plan)?)))?;
+        Some(EncodedShard {
+            encoded: unfinished::read(info, dir, shard).ok()?,
+            bad: saved.bad,
+        })
+    }
+
+    /// Saves a shard in the directory `here`. What was left out is named as if it had been unpacked in the directory `there`.
+    /// Errors: `Io`, `Dataset`.
+    pub(super) fn save(
+        &self,
+        info: &DatasetInfo,
+        shard: usize,
+        made: EncodedShard,
+        (here, there): (&Path, &Path),
+    ) -> Result<(), ImportError> {
+        unfinished::save(info, here, shard, 0, &made.encoded)?;
+        let saved = SavedShard {
+            plan: self.plan.clone(),
+            bad: made.bad.moved(here, there),
+        };
+        let text = serde_json::to_vec(&saved).expect("a list of texts that JSON cannot hold is a bug");
+        Ok(write_atomically(&path(here, shard), &text)?)
+    }
+}
+
+fn path(dir: &Path, shard: usize) -> PathBuf {
+    dir.join("shards").join(format!("shard-{shard:06}.json"))
+}
+
+/// `None` if it is missing or damaged: the shard is made again.
+fn saved_shard(dir: &Path, shard: usize) -> Option<SavedShard> {
+    serde_json::from_slice(&fs::read(path(dir, shard)).ok()?).ok()
+}
+
+/// How many shards a part has saved.
+#[must_use]
+pub fn saved_part_shards(dir: &Path) -> usize {
+    fs::read_dir(dir.join("shards")).map_or(0, Iterator::count)
+}
+
+/// The hash of all that decides the shards, but for the images: two machines can have different files in a place.
+fn hash(config: &ImportConfig, plan: &ImportPlan) -> String {
+    let mut hash = Sha256::new();
+    let described = (
+        env!("CARGO_PKG_VERSION"),
+        &config.options,
+        plan.frame_period_s,
+        &plan.recording.action_channels,
+        &plan.recording.state_channels,
+    );
+    hash.update(serde_json::to_vec(&described).expect("a description that JSON cannot hold is a bug"));
+    for episode in &plan.episodes {
+        hash.update((episode.len() as u64).to_le_bytes());
+        for frame in episode {
+            let record = &plan.recording.records[frame.record];
+            hash.update((frame.record as u64).to_le_bytes());
+            hash.update(record.timestamp_s.to_le_bytes());
+            for value in frame.action.iter().chain(&record.state) {
+                hash.update(value.to_le_bytes());
+            }
+        }
+    }
+    format!("{:x}", hash.finalize())
+}
