@@ -61,8 +61,8 @@ pub fn import(
     let write = || {
         // Its images are read while the data set is written.
         let source = UnpackedSource::of(config, cancelled)?;
-        let written =
-            plan(&source.path, config, cancelled).and_then(|plan| directory.write(&plan, on_progress, cancelled));
+        let written = plan(&source.path, config, cancelled)
+            .and_then(|plan| directory.write(&plan, &source, on_progress, cancelled));
         written.map_err(|error| source.name_in_archive(error))
     };
     let imported = write();

@@ -9,6 +9,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use serde::Serialize;
 
+use super::archive::UnpackedSource;
 use super::recording::{Record, Recording};
 use super::skipped::{MAX_ITEMS, SkippedItem, SkippedList};
 use super::timing::ImportPlan;
@@ -176,6 +177,7 @@ impl<'a> Directory<'a> {
     pub(super) fn write(
         &self,
         plan: &ImportPlan,
+        source: &UnpackedSource,
         on_progress: &(dyn Fn(ImportProgress) + Sync),
         cancelled: &AtomicBool,
     ) -> Result<Imported, ImportError> {
@@ -208,7 +210,11 @@ impl<'a> Directory<'a> {
                     other => other,
                 })?;
                 let room = MAX_ITEMS.saturating_sub(skipped.len());
-                skipped.extend(bad.items(room).into_iter().map(|item| (Some(shard), item)));
+                skipped.extend(
+                    bad.items(room)
+                        .into_iter()
+                        .map(|item| (Some(shard), source.item_in_archive(item))),
+                );
                 self.write_skipped(&skipped)?;
                 writer.write(&encoded)?;
             }
@@ -219,7 +225,10 @@ impl<'a> Directory<'a> {
             return Err(ImportError::Empty(self.config.source.clone()));
         }
         let listed = plan.recording.skipped.items(MAX_ITEMS).into_iter();
-        let mut all: Vec<(Option<usize>, SkippedItem)> = listed.map(|item| (None, item)).chain(skipped).collect();
+        let mut all: Vec<(Option<usize>, SkippedItem)> = listed
+            .map(|item| (None, source.item_in_archive(item)))
+            .chain(skipped)
+            .collect();
         all.sort_by_key(|(of, _)| *of);
         self.write_skipped(&all)?;
         remove_partials(&self.config.out);
