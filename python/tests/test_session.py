@@ -197,7 +197,8 @@ def test_the_async_session_does_the_same(proxy: Proxy, drive: Drive, unbroken: l
                     proxy.cut()
                 found.append(await session.step(drive.frames[n], action=drive.actions[n], state=drive.states[n]))
             await session.rollouts([drive.actions[4:9]])
-            assert (await session.plan(foreframe.Goal(heading_rad=0.2))).actions.shape == (5, 2)
+            plan = await session.plan(foreframe.Goal(heading_rad=0.2), with_obstacles=True)
+            assert plan.actions.shape == (5, 2) and plan.obstacles is None
         return found
 
     same(asyncio.run(stream()), unbroken)

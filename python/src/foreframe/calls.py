@@ -167,6 +167,7 @@ def plan(
     action: Vector | None,
     resize: str | None,
     camera: Camera | None,
+    with_obstacles: bool,
     search: Mapping[str, Any],
 ) -> Call[Plan]:
     image_format, images = encode_all(frames, spec.size)
@@ -182,6 +183,7 @@ def plan(
         camera=camera and camera.body(),
         search=_search(search),
         with_frames=True,
+        with_obstacles=with_obstacles,
     )
     return Call("POST", path("models", name, "plan"), partial(Plan.of, size=spec.size), body, is_binary=True)
 
@@ -195,6 +197,7 @@ def session_plan(
     state: Vector | None,
     present: Vectors | None,
     action: Vector | None,
+    with_obstacles: bool,
     search: Mapping[str, Any],
 ) -> Call[Plan]:
     body = given(
@@ -205,6 +208,7 @@ def session_plan(
         action=numbers(action),
         search=_search(search),
         with_frames=True,
+        with_obstacles=with_obstacles,
     )
     read, headers = partial(Plan.of, size=spec.size), {"x-session-token": token}
     return Call("POST", path("sessions", session, "plan"), read, body, headers=headers, is_binary=True)

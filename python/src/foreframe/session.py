@@ -110,13 +110,14 @@ class Session:
         state: Vector | None = None,
         present: Vectors | None = None,
         action: Vector | None = None,
+        with_obstacles: bool = False,
         **search: Any,
     ) -> Plan:
         """Searches for the plan that reaches ``goal`` best, from the last frame. See :meth:`Client.plan`.
 
         ``present`` is by default the plan of the last frame.
         """
-        return self._run(self._flow.plan(goal, state, present, action, search))
+        return self._run(self._flow.plan(goal, state, present, action, with_obstacles, search))
 
     def close(self) -> None:
         """Ends the session."""
@@ -218,10 +219,11 @@ class AsyncSession:
         state: Vector | None = None,
         present: Vectors | None = None,
         action: Vector | None = None,
+        with_obstacles: bool = False,
         **search: Any,
     ) -> Plan:
         """As :meth:`Session.plan`."""
-        return await self._run(self._flow.plan(goal, state, present, action, search))
+        return await self._run(self._flow.plan(goal, state, present, action, with_obstacles, search))
 
     async def close(self) -> None:
         """Ends the session."""

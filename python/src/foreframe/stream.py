@@ -150,13 +150,21 @@ class SessionFlow:
         state: Vector | None,
         present: Vectors | None,
         action: Vector | None,
+        with_obstacles: bool,
         search: Mapping[str, Any],
     ) -> Flow[Plan]:
         """The Plan from the last frame."""
 
         def call(spec: Spec) -> Call[Plan]:
             return calls.session_plan(
-                *self.identity, spec, goal, state=state, present=present, action=action, search=search
+                *self.identity,
+                spec,
+                goal,
+                state=state,
+                present=present,
+                action=action,
+                with_obstacles=with_obstacles,
+                search=search,
             )
 
         return self._asked(call)
