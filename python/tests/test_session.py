@@ -3,6 +3,7 @@
 import asyncio
 import socket
 import threading
+import time
 from collections.abc import Iterator
 
 import numpy as np
@@ -188,6 +189,37 @@ def test_a_session_rolls_plans_out_also_after_it_was_lost(client: foreframe.Clie
     assert before.frames.shape == (2, 5, 64, 64) and np.array_equal(before.frames, after.frames)
 
 
+def test_plans_come_with_the_predictions(proxy: Proxy, drive: Drive) -> None:
+    goal, search = foreframe.Goal(heading_rad=0.5), {"seed": 1, "samples": 64, "budget_ms": 5000}
+    with foreframe.Client(proxy.url) as client, client.session(MODEL) as session:
+        with pytest.raises(foreframe.StreamError, match="goal is empty"):
+            session.plan_every(1, foreframe.Goal())
+        with pytest.raises(ValueError, match="goal"):
+            session.plan_every(1)
+        session.plan_every(1, goal, **search)
+        answers(session, drive, range(5))
+        asked = session.plan(goal, **search)
+        found = [answer.plan for answer in slowly(session, drive, range(5, 8))]
+        assert found[0] is not None and found[0].seq == 4
+        assert np.array_equal(found[0].plan.actions, asked.actions), "the same as by a request"
+        # Another stream of the session is told of the plans too.
+        proxy.cut()
+        found = [answer.plan for answer in slowly(session, drive, range(8, 11))]
+        assert found[-1] is not None and found[-1].seq == 9
+        session.plan_every(0)
+        slowly(session, drive, range(11, 12))
+        assert all(answer.plan is None for answer in slowly(session, drive, range(0, 3)))
+
+
+def slowly(session: foreframe.Session, drive: Drive, numbers: range) -> list[foreframe.Answer]:
+    """With time for a plan before each frame."""
+    found = []
+    for n in numbers:
+        time.sleep(0.5)
+        found += answers(session, drive, range(n, n + 1))
+    return found
+
+
 def test_the_async_session_does_the_same(proxy: Proxy, drive: Drive, unbroken: list[foreframe.Answer]) -> None:
     async def stream() -> list[foreframe.Answer]:
         found = []
@@ -199,6 +231,8 @@ def test_the_async_session_does_the_same(proxy: Proxy, drive: Drive, unbroken: l
             await session.rollouts([drive.actions[4:9]])
             plan = await session.plan(foreframe.Goal(heading_rad=0.2), with_obstacles=True)
             assert plan.actions.shape == (5, 2) and plan.obstacles is None
+            await session.plan_every(1, foreframe.Goal(heading_rad=0.2), samples=16)
+            await session.plan_every(0)
         return found
 
     same(asyncio.run(stream()), unbroken)

@@ -200,18 +200,23 @@ def session_plan(
     with_obstacles: bool,
     search: Mapping[str, Any],
 ) -> Call[Plan]:
-    body = given(
+    body = {
+        **session_plan_body(spec, goal, with_obstacles, search),
+        **given(state=numbers(state), present=numbers(present), action=numbers(action)),
+    }
+    read, headers = partial(Plan.of, size=spec.size), {"x-session-token": token}
+    return Call("POST", path("sessions", session, "plan"), read, body, headers=headers, is_binary=True)
+
+
+def session_plan_body(spec: Spec, goal: Goal, with_obstacles: bool, search: Mapping[str, Any]) -> dict[str, Any]:
+    """What the plans of a session are asked for with."""
+    return given(
         format="raw",
         goal=goal.body(spec.size, "raw"),
-        state=numbers(state),
-        present=numbers(present),
-        action=numbers(action),
         search=_search(search),
         with_frames=True,
         with_obstacles=with_obstacles,
     )
-    read, headers = partial(Plan.of, size=spec.size), {"x-session-token": token}
-    return Call("POST", path("sessions", session, "plan"), read, body, headers=headers, is_binary=True)
 
 
 def _search(search: Mapping[str, Any]) -> Mapping[str, Any] | None:

@@ -301,6 +301,17 @@ class Plan(PlannedActions):
 
 
 @dataclass(frozen=True)
+class FramePlan:
+    """A plan that the server searched for beside the predictions of a session (``Session.plan_every``)."""
+
+    #: The number of the frame from which it was searched for.
+    seq: int
+    plan: Plan
+    #: Plans that were due since the last one, but skipped, because the search before had not ended or the server was busy.
+    skipped: int
+
+
+@dataclass(frozen=True)
 class Answer:
     """The answer to a frame of a session."""
 
@@ -315,6 +326,8 @@ class Answer:
     need: int
     #: Whether the server had lost the session, so that the last frames were sent again before this one.
     replayed: bool = False
+    #: The newest plan that came since the answer before; None if none came, or ``plan_every`` was not called.
+    plan: FramePlan | None = None
 
 
 @dataclass(frozen=True)

@@ -119,6 +119,17 @@ class Session:
         """
         return self._run(self._flow.plan(goal, state, present, action, with_obstacles, search))
 
+    def plan_every(
+        self, frames: int, goal: Goal | None = None, *, with_obstacles: bool = False, **search: Any
+    ) -> None:
+        """Asks for a plan with every so many predictions, from the next one on; 0: for none.
+
+        The server searches beside the predictions, which do not wait; ``step`` gives the newest plan as ``answer.plan``, often of
+        the frame before. ``goal`` is relative to the robot at the frame of each plan: call this again as the robot moves.
+        ``search``: see :meth:`Client.plan`. Raises StreamError if a goal or a setting does not fit the model.
+        """
+        self._run(self._flow.plan_every(frames, goal, with_obstacles, search))
+
     def close(self) -> None:
         """Ends the session."""
         self._run(self._flow.close())
@@ -224,6 +235,12 @@ class AsyncSession:
     ) -> Plan:
         """As :meth:`Session.plan`."""
         return await self._run(self._flow.plan(goal, state, present, action, with_obstacles, search))
+
+    async def plan_every(
+        self, frames: int, goal: Goal | None = None, *, with_obstacles: bool = False, **search: Any
+    ) -> None:
+        """As :meth:`Session.plan_every`."""
+        await self._run(self._flow.plan_every(frames, goal, with_obstacles, search))
 
     async def close(self) -> None:
         """Ends the session."""
