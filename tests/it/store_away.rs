@@ -155,7 +155,9 @@ fn a_server_survives_a_database_that_goes_away() {
     postgres.start();
     let dir = tempfile::tempdir().unwrap();
     let url = postgres.url();
-    let server = RunningServer::start(dir.path(), &["--run-jobs", "false", "--database-url", &url]);
+    // Shorter than a statement may take.
+    let settings = ["--run-jobs", "false", "--database-url", &url, "--set", "request_deadline_ms=5000"];
+    let server = RunningServer::start(dir.path(), &settings);
     assert_eq!(server.ask("POST", "/v1/jobs", &collect("before"))["id"], "job-1");
 
     postgres.stop();
@@ -170,6 +172,8 @@ fn a_server_survives_a_database_that_goes_away() {
 
     postgres.signal("-STOP");
     wait_for_status(&server, "/readyz", "503");
+    let refused = wait_for_status(&server, "/v1/jobs", "503");
+    assert!(refused.contains("no answer was ready within 5000 ms"), "{refused}");
     assert_eq!(status(&server.get("/livez")), "200");
     postgres.signal("-CONT");
     wait_for_status(&server, "/readyz", "200");

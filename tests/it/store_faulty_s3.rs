@@ -49,6 +49,8 @@ struct ProxyState {
     requests: AtomicUsize,
     truncated: AtomicUsize,
     is_away: AtomicBool,
+    /// Takes connections and never answers, as behind a cut network.
+    is_silent: AtomicBool,
 }
 
 /// A proxy in front of an S3 server. It ends with the test's process.
@@ -76,6 +78,9 @@ impl FaultyProxy {
 
 /// Forwards one request and closes the connection.
 fn forward(mut client: TcpStream, server: &str, state: &ProxyState) -> std::io::Result<()> {
+    while state.is_silent.load(Ordering::Acquire) {
+        std::thread::sleep(Duration::from_millis(50));
+    }
     if state.is_away.load(Ordering::Acquire) {
         return Ok(());
     }
@@ -215,7 +220,11 @@ fn jobs_end_the_same_behind_a_faulty_connection_to_s3() {
     proxy.state.is_away.store(true, Ordering::Release);
     let refused = wait_for_status(&server, "/v1/datasets", "503");
     assert!(refused.to_lowercase().contains("\r\nretry-after: "), "{refused}");
+    proxy.state.is_silent.store(true, Ordering::Release);
+    let refused = server.get("/v1/datasets");
+    assert!(status(&refused) == "503" && refused.contains("no answer within 10 s"), "{refused}");
     proxy.state.is_away.store(false, Ordering::Release);
+    proxy.state.is_silent.store(false, Ordering::Release);
     let job = server.wait_for_job("job-2", |job| job["state"] == "succeeded");
     assert_eq!(
         (&job["attempts"], &job["result"]["version"]),

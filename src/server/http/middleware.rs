@@ -4,6 +4,7 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, LazyLock};
 use std::time::{Duration, Instant, SystemTime};
 
+use axum::body::HttpBody as _;
 use axum::extract::{Request, State};
 use axum::http::{HeaderMap, HeaderName, HeaderValue, Method, header};
 use axum::middleware::Next;
@@ -75,8 +76,13 @@ pub(in crate::server) async fn trace(State(trace): State<RequestTrace>, request:
         let started = Instant::now();
         let answered = async {
             refuse_encoded(request.headers())?;
+            let is_whole = request.body().is_end_stream();
             let late = |_| {
                 let limit_ms = limit.as_millis();
+                if is_whole {
+                    // It is not the client that was slow.
+                    return ApiError::unavailable(format!("no answer was ready within {limit_ms} ms"));
+                }
                 ApiError::Timeout(format!(
                     "the request took longer than {limit_ms} ms to arrive and be answered"
                 ))

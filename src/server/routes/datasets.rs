@@ -93,8 +93,13 @@ async fn list(app: App, Query(page): Query<Page>) -> Result<axum::Json<DatasetLi
     let (names, next) = page.of(names, DatasetName::as_str)?;
     let mut datasets = Vec::new();
     for name in names {
-        // A damaged data set, or one that is being deleted, must not hide the others.
-        datasets.extend(describe(&app, &name).await.ok());
+        match describe(&app, &name).await {
+            Ok(dataset) => datasets.push(dataset),
+            // A list without them would be taken for the whole one.
+            Err(error @ ApiError::Unavailable { .. }) => return Err(error),
+            // A damaged data set, or one that is being deleted, must not hide the others.
+            Err(_) => {}
+        }
     }
     Ok(axum::Json(DatasetList { datasets, next }))
 }

@@ -6,6 +6,7 @@ use std::fmt::Display;
 use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
 
 use futures_util::TryStreamExt as _;
 use object_store::local::LocalFileSystem;
@@ -17,6 +18,10 @@ use super::StoreError;
 use foreframe_core::files::{
     files_below, is_hidden, is_partial, none_if_missing, remove_dir, remove_stale_partials, write_atomically,
 };
+
+/// How long the object store may take to say what it has. A request that asks must be answered before its own limit; a job
+/// asks again.
+const QUESTION_LIMIT: Duration = Duration::from_secs(10);
 
 /// The data directory, and the shared object store if there is one.
 #[derive(Clone)]
@@ -165,7 +170,7 @@ impl Objects {
             return Ok(Vec::new());
         };
         let key = Key::from(dir);
-        let found = shared.list_with_delimiter(Some(&key)).await;
+        let found = in_time(shared.list_with_delimiter(Some(&key))).await;
         let names = found.map_err(failed("list", &key))?.common_prefixes;
         Ok(names.iter().filter_map(Key::filename).map(str::to_owned).collect())
     }
@@ -200,7 +205,7 @@ impl Objects {
         };
         let prefix = Key::from(dir);
         let listed = shared.list(Some(&prefix)).try_collect();
-        listed.await.map_err(failed("list", &prefix))
+        in_time(listed).await.map_err(failed("list", &prefix))
     }
 }
 
@@ -211,7 +216,7 @@ async fn head(
     action: &'static str,
 ) -> Result<Option<ObjectMeta>, StoreError> {
     let key = Key::from(path);
-    match shared.head(&key).await {
+    match in_time(shared.head(&key)).await {
         Ok(object) => Ok(Some(object)),
         Err(object_store::Error::NotFound { .. }) => Ok(None),
         Err(error) => Err(failed(action, &key)(error)),
@@ -228,10 +233,21 @@ async fn read(shared: &Arc<dyn ObjectStore>, object: &ObjectMeta) -> Result<Vec<
     }
     // The fault is on the way to the object store, so it is worth trying again.
     let reason = format!("the answer has {} bytes; the object has {}", bytes.len(), object.size);
-    Err(failed("read", key)(object_store::Error::Generic {
+    Err(failed("read", key)(broken(reason)))
+}
+
+/// Errors: also without an answer within [`QUESTION_LIMIT`].
+async fn in_time<T>(answer: impl Future<Output = object_store::Result<T>>) -> object_store::Result<T> {
+    let late = |_| Err(broken(format!("no answer within {} s", QUESTION_LIMIT.as_secs())));
+    tokio::time::timeout(QUESTION_LIMIT, answer).await.unwrap_or_else(late)
+}
+
+/// An error that may pass.
+fn broken(reason: String) -> object_store::Error {
+    object_store::Error::Generic {
         store: "object store",
         source: reason.into(),
-    }))
+    }
 }
 
 /// Writes a file, with its directory.
@@ -272,7 +288,7 @@ fn bucket(url: &str) -> Result<Arc<dyn ObjectStore>, StoreError> {
     // A job waits for longer than that itself; a request gets 503.
     let retry = object_store::RetryConfig {
         max_retries: 5,
-        retry_timeout: std::time::Duration::from_secs(10),
+        retry_timeout: Duration::from_secs(10),
         ..object_store::RetryConfig::default()
     };
     let bucket = object_store::aws::AmazonS3Builder::from_env()
