@@ -156,7 +156,14 @@ fn a_server_survives_a_database_that_goes_away() {
     let dir = tempfile::tempdir().unwrap();
     let url = postgres.url();
     // Shorter than a statement may take.
-    let settings = ["--run-jobs", "false", "--database-url", &url, "--set", "request_deadline_ms=5000"];
+    let settings = [
+        "--run-jobs",
+        "false",
+        "--database-url",
+        &url,
+        "--set",
+        "request_deadline_ms=5000",
+    ];
     let server = RunningServer::start(dir.path(), &settings);
     assert_eq!(server.ask("POST", "/v1/jobs", &collect("before"))["id"], "job-1");
 

@@ -222,7 +222,10 @@ fn jobs_end_the_same_behind_a_faulty_connection_to_s3() {
     assert!(refused.to_lowercase().contains("\r\nretry-after: "), "{refused}");
     proxy.state.is_silent.store(true, Ordering::Release);
     let refused = server.get("/v1/datasets");
-    assert!(status(&refused) == "503" && refused.contains("no answer within 10 s"), "{refused}");
+    assert!(
+        status(&refused) == "503" && refused.contains("no answer within 10 s"),
+        "{refused}"
+    );
     proxy.state.is_away.store(false, Ordering::Release);
     proxy.state.is_silent.store(false, Ordering::Release);
     let job = server.wait_for_job("job-2", |job| job["state"] == "succeeded");
