@@ -82,7 +82,7 @@ const SHORT_FORMS: [&str; 8] = [
     "slow-reader --rounds 1 --seconds 2 --warm-up-s 0.5 --noise-ms 1000 --growth-mib 40",
     "churn --sessions 300 --requests 3000 --growth-mib 40",
     "previews --rounds 1 --seconds 2 --noise-ms 1000",
-    "plans --model moving-flow --seconds 2 --warm-up-s 0.5 --p99-ms 1000",
+    "plans --seconds 2 --warm-up-s 0.5 --p99-ms 1000",
     "health --seconds 3 --livez-p99-ms 1000 --p99-ms 1000",
 ];
 
