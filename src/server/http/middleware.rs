@@ -2,13 +2,15 @@
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, LazyLock};
+use std::task::Poll;
 use std::time::{Duration, Instant, SystemTime};
 
-use axum::body::HttpBody as _;
+use axum::body::{Body, Bytes, HttpBody as _};
 use axum::extract::{Request, State};
 use axum::http::{HeaderMap, HeaderName, HeaderValue, Method, header};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
+use futures_util::{StreamExt as _, stream};
 use metrics::{counter, histogram};
 use tracing::{Instrument, debug, info_span};
 
@@ -59,6 +61,21 @@ fn request_id(headers: &HeaderMap) -> String {
     }
 }
 
+/// The same request, and whether all of it has arrived.
+fn with_arrival(request: Request) -> (Request, Arc<AtomicBool>) {
+    let has_arrived = Arc::new(AtomicBool::new(request.body().is_end_stream()));
+    if has_arrived.load(Ordering::Acquire) {
+        return (request, has_arrived);
+    }
+    let at_end = Arc::clone(&has_arrived);
+    let end = stream::poll_fn(move |_| {
+        at_end.store(true, Ordering::Release);
+        Poll::Ready(None::<Result<Bytes, axum::Error>>)
+    });
+    let request = request.map(|body| Body::from_stream(body.into_data_stream().chain(end)));
+    (request, has_arrived)
+}
+
 /// Runs the request in a span with its id, within the deadline; writes the body of an error; counts the response.
 pub(in crate::server) async fn trace(State(trace): State<RequestTrace>, request: Request, next: Next) -> Response {
     let id = request_id(request.headers());
@@ -76,10 +93,10 @@ pub(in crate::server) async fn trace(State(trace): State<RequestTrace>, request:
         let started = Instant::now();
         let answered = async {
             refuse_encoded(request.headers())?;
-            let is_whole = request.body().is_end_stream();
+            let (request, has_arrived) = with_arrival(request);
             let late = |_| {
                 let limit_ms = limit.as_millis();
-                if is_whole {
+                if has_arrived.load(Ordering::Acquire) {
                     // It is not the client that was slow.
                     return ApiError::unavailable(format!("no answer was ready within {limit_ms} ms"));
                 }
