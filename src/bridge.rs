@@ -1,17 +1,19 @@
 //! A client of a running robot that speaks Foxglove's WebSocket protocol: subscribes the camera, the command and the odometry,
 //! predicts, and publishes what it predicted.
 //!
-//! `protocol` has the messages, `connection` the socket, `topics` chooses what is subscribed, `live_prediction` brings images to the
+//! `protocol` has the messages, `connection` the socket, `robot_stream` its bytes, `topics` chooses what is subscribed, `live_prediction` brings images to the
 //! model's frame rate and compares predictions with what came.
 
 mod connection;
 mod live_prediction;
 mod protocol;
+mod robot_stream;
 mod topics;
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
+pub(crate) use self::connection::RobotAddress;
 use self::connection::{Incoming, RobotConnection};
 pub(crate) use self::live_prediction::LiveStep;
 use self::live_prediction::{LivePrediction, Seen};
@@ -34,6 +36,9 @@ pub(crate) enum BridgeError {
     /// The address cannot be used.
     #[error("\"{0}\" is no address of a robot; give one like ws://192.168.1.20:8765")]
     Address(String),
+    /// TLS cannot be used as it was asked.
+    #[error("{0}")]
+    Tls(String),
     /// Nothing answers there, or the connection ended.
     #[error("could not {action} the robot at {address}: {reason}")]
     Connection {
@@ -69,7 +74,7 @@ pub(crate) enum BridgeError {
 impl HasErrorKind for BridgeError {
     fn kind(&self) -> ErrorKind {
         match self {
-            Self::Address(_) | Self::Topic(_) => ErrorKind::Usage,
+            Self::Address(_) | Self::Tls(_) | Self::Topic(_) => ErrorKind::Usage,
             Self::Connection { .. } => ErrorKind::Away,
             Self::NoPublishing(_) | Self::Message { .. } => ErrorKind::Unusable,
             Self::Serving(error) => error.kind(),
@@ -98,7 +103,7 @@ pub(crate) enum BridgeEvent {
 
 /// Predicts for the robot at `address` until cancelled or until the connection ends. Errors: every [`BridgeError`].
 pub(crate) fn run(
-    address: &str,
+    address: &RobotAddress,
     names: &TopicNames,
     model: &Arc<Model>,
     on_event: &mut dyn FnMut(BridgeEvent),

@@ -2,7 +2,7 @@
 //! handlers share, [`protocol`] the messages of a stream.
 //!
 //! The rooms in the order in which they may use each other; each uses only those before it:
-//! `config`, `msgpack`, `http` (connections, limits, keys, problem details), `blocking`, `render_cache`, `images`, `stream` (a session and its
+//! `config`, `msgpack`, `http` (connections, limits, keys, problem details), `blocking`, `render_cache`, `images`, `request_inputs`, `plans`, `stream` (a session and its
 //! WebSocket), `environments`, `uploads`, `inference_statistics`, `state` ([`App`]), `routes` (one resource a file), `openapi`, `router`, `admin` (health checks and metrics on their own
 //! address), `serve`.
 
@@ -17,7 +17,9 @@ mod msgpack;
 mod nested_numbers;
 mod openapi;
 mod openpi;
+mod plans;
 mod render_cache;
+mod request_inputs;
 mod router;
 mod routes;
 mod serve;
@@ -33,6 +35,10 @@ pub use http::problem::Problem;
 pub use http::tls::{ServerTls, TlsError};
 pub use http::{keys, shutdown};
 pub use images::{ImageBytes, ImageFormat};
+#[doc(hidden)]
+pub use plans::request::SessionPlanRequest;
+#[doc(hidden)]
+pub use plans::response::PlanResponse;
 pub use router::{openapi_document, router};
 pub use serve::{ServerListeners, serve};
 pub use state::{App, AppParts, start_jobs};

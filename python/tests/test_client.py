@@ -118,6 +118,30 @@ def test_a_plan_turns_to_its_goal(client: foreframe.Client, drive: Drive) -> Non
         client.plan(MODEL, drive.frames[:5], foreframe.Goal(), state=drive.states[4])
 
 
+def test_a_plan_shows_what_stands_in_the_way(server: foreframe.Server, client: foreframe.Client, drive: Drive) -> None:
+    goal, search = foreframe.Goal(position_m=(0.4, 0.3)), {"seed": 3, "samples": 32, "budget_ms": 5000}
+    context = {"states": drive.states[:5], "with_obstacles": True}
+    shown = client.plan("rooms", drive.frames[:5], goal, **context, **search).obstacles
+    assert shown is not None and shown.fixed_m.dtype == np.float32 and shown.fixed_m.shape[1] == 2 and len(shown.fixed_m) > 10
+    assert np.all(shown.fixed_m[:, 0] > -0.1), "the camera looks ahead"
+    assert len(shown.movers_m) == 6 and all(cells.ndim == 2 and cells.shape[1] == 2 for cells in shown.movers_m)
+    assert client.plan("rooms", drive.frames[:5], goal, states=drive.states[:5], **search).obstacles is None
+    with client.session("rooms") as session:
+        for n in range(5):
+            session.step(drive.frames[n], action=drive.actions[n], state=drive.states[n])
+        of_session = session.plan(goal, with_obstacles=True, **search).obstacles
+    assert of_session is not None and np.array_equal(of_session.fixed_m, shown.fixed_m)
+
+    async def ask() -> foreframe.Plan:
+        async with foreframe.AsyncClient(server.url) as twin:
+            return await twin.plan("rooms", drive.frames[:5], goal, **context, **search)
+
+    of_async = asyncio.run(ask()).obstacles
+    assert of_async is not None and np.array_equal(of_async.fixed_m, shown.fixed_m)
+    unchecked = client.plan(MODEL, drive.frames[:5], goal, state=drive.states[4], with_obstacles=True, **search)
+    assert unchecked.obstacles is None and not unchecked.clearance_checked
+
+
 def test_errors_have_the_words_of_the_server(client: foreframe.Client, drive: Drive) -> None:
     with pytest.raises(foreframe.ApiError, match="no model") as missing:
         client.model("nothing")

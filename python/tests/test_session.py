@@ -3,6 +3,7 @@
 import asyncio
 import socket
 import threading
+import time
 from collections.abc import Iterator
 
 import numpy as np
@@ -188,6 +189,39 @@ def test_a_session_rolls_plans_out_also_after_it_was_lost(client: foreframe.Clie
     assert before.frames.shape == (2, 5, 64, 64) and np.array_equal(before.frames, after.frames)
 
 
+def test_plans_come_with_the_predictions(proxy: Proxy, drive: Drive) -> None:
+    goal, search = foreframe.Goal(heading_rad=0.5), {"seed": 1, "samples": 64, "budget_ms": 5000}
+    with foreframe.Client(proxy.url) as client, client.session(MODEL) as session:
+        with pytest.raises(foreframe.StreamError, match="goal is empty"):
+            session.plan_every(1, foreframe.Goal())
+        with pytest.raises(ValueError, match="goal"):
+            session.plan_every(1)
+        session.plan_every(1, goal, **search)
+        answers(session, drive, range(5))
+        asked = session.plan(goal, **search)
+        found = next_plan(session, drive, 0)
+        assert found.seq == 4 and np.array_equal(found.plan.actions, asked.actions), "the same as by a request"
+        # Another stream of the session is told of the plans too.
+        proxy.cut()
+        assert next_plan(session, drive, session.next_seq).plan.samples == 258
+        session.plan_every(0)
+        last = session.next_seq
+        answers(session, drive, range(4))
+        session.plan(goal, **search)
+        late = [answer.plan for answer in answers(session, drive, range(4)) if answer.plan]
+        assert all(plan.seq < last for plan in late)
+
+
+def next_plan(session: foreframe.Session, drive: Drive, from_seq: int) -> foreframe.FramePlan:
+    """Sends frames until a plan from that frame or a later one comes."""
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline:
+        (answer,) = answers(session, drive, range(session.next_seq % 12, session.next_seq % 12 + 1))
+        if answer.plan and answer.plan.seq >= from_seq:
+            return answer.plan
+    raise AssertionError("no plan came")
+
+
 def test_the_async_session_does_the_same(proxy: Proxy, drive: Drive, unbroken: list[foreframe.Answer]) -> None:
     async def stream() -> list[foreframe.Answer]:
         found = []
@@ -197,7 +231,10 @@ def test_the_async_session_does_the_same(proxy: Proxy, drive: Drive, unbroken: l
                     proxy.cut()
                 found.append(await session.step(drive.frames[n], action=drive.actions[n], state=drive.states[n]))
             await session.rollouts([drive.actions[4:9]])
-            assert (await session.plan(foreframe.Goal(heading_rad=0.2))).actions.shape == (5, 2)
+            plan = await session.plan(foreframe.Goal(heading_rad=0.2), with_obstacles=True)
+            assert plan.actions.shape == (5, 2) and plan.obstacles is None
+            await session.plan_every(1, foreframe.Goal(heading_rad=0.2), samples=16)
+            await session.plan_every(0)
         return found
 
     same(asyncio.run(stream()), unbroken)

@@ -2,6 +2,7 @@
 
 use std::io::ErrorKind;
 use std::net::{TcpStream, ToSocketAddrs as _};
+use std::path::PathBuf;
 use std::time::Duration;
 
 use serde_json::Value;
@@ -12,6 +13,7 @@ use tungstenite::{Message, WebSocket};
 
 use super::BridgeError;
 use super::protocol::{PublishedTopic, RobotData, RobotMessage, SUBPROTOCOLS, client_data};
+use super::robot_stream::{RobotStream, RobotTls};
 
 /// How long a connection may take to open, and a message to be taken by the robot.
 const TIMEOUT: Duration = Duration::from_secs(10);
@@ -30,48 +32,54 @@ pub(super) enum Incoming {
     },
 }
 
+/// Where a robot is, and how it is known to be the right one.
+pub(crate) struct RobotAddress {
+    /// `ws://HOST:PORT` or `wss://HOST:PORT`.
+    pub(crate) url: String,
+    /// A PEM file with the certificates to trust for `wss://`; without it, those that the system trusts.
+    pub(crate) ca_certificate: Option<PathBuf>,
+}
+
 /// An open connection.
 pub(super) struct RobotConnection {
     address: String,
-    socket: WebSocket<TcpStream>,
+    socket: WebSocket<RobotStream>,
 }
 
 impl RobotConnection {
-    /// Errors: `Address`, `Connection`.
-    pub(super) fn open(address: &str) -> Result<Self, BridgeError> {
-        let wrong = || BridgeError::Address(address.to_owned());
-        let mut request = address.into_client_request().map_err(|_| wrong())?;
+    /// Errors: `Address`, `Connection`, `Tls`.
+    pub(super) fn open(address: &RobotAddress) -> Result<Self, BridgeError> {
+        let RobotAddress { url, ca_certificate } = address;
+        let wrong = || BridgeError::Address(url.clone());
+        let mut request = url.into_client_request().map_err(|_| wrong())?;
         let uri = request.uri();
-        let (Some("ws"), Some(host)) = (uri.scheme_str(), uri.host()) else {
-            return Err(wrong());
+        let host = uri.host().ok_or_else(wrong)?.trim_matches(['[', ']']).to_owned();
+        let port = uri.port_u16().unwrap_or(DEFAULT_PORT);
+        let tls = match uri.scheme_str() {
+            Some("ws") => None,
+            Some("wss") => Some(RobotTls::new(ca_certificate.as_deref())?),
+            _ => return Err(wrong()),
         };
-        let target = (
-            host.trim_matches(['[', ']']).to_owned(),
-            uri.port_u16().unwrap_or(DEFAULT_PORT),
-        );
         let protocols = HeaderValue::from_static(SUBPROTOCOLS);
         request.headers_mut().insert(SEC_WEBSOCKET_PROTOCOL, protocols);
-        let failed = |reason: String| BridgeError::Connection {
-            action: "connect to",
-            address: address.to_owned(),
-            reason,
-        };
-        let found = target.to_socket_addrs().map_err(|error| failed(error.to_string()))?;
-        let mut last = "its name has no address".to_owned();
-        for one in found {
-            match TcpStream::connect_timeout(&one, TIMEOUT).and_then(|stream| prepare(&stream).map(|()| stream)) {
-                Ok(stream) => {
-                    let opened = tungstenite::client(request, stream);
-                    let (socket, _) = opened.map_err(|error| failed(error.to_string()))?;
-                    let set = socket.get_ref().set_read_timeout(Some(WAIT));
-                    set.map_err(|error| failed(error.to_string()))?;
-                    let address = address.to_owned();
-                    return Ok(Self { address, socket });
-                }
-                Err(error) => last = error.to_string(),
-            }
+        let opened = connect(&host, port).and_then(|stream| match tls {
+            None => Ok(RobotStream::Plain(stream)),
+            Some(tls) => tls.handshake(host, stream),
+        });
+        let opened = opened.and_then(|stream| {
+            let (socket, _) = tungstenite::client(request, stream).map_err(|error| error.to_string())?;
+            let set = socket.get_ref().tcp().set_read_timeout(Some(WAIT));
+            set.map(|()| socket).map_err(|error| error.to_string())
+        });
+        let address = url.clone();
+        match opened {
+            Ok(socket) => Ok(Self { address, socket }),
+            Err(reason) => Err(BridgeError::Connection {
+                action: "connect to",
+                address,
+                reason,
+            }),
         }
-        Err(failed(last))
     }
 
     fn failed(&self, action: &'static str, error: &tungstenite::Error) -> BridgeError {
@@ -123,6 +131,19 @@ impl RobotConnection {
         let sent = self.socket.send(message);
         sent.map_err(|error| self.failed("write to", &error))
     }
+}
+
+/// A connection to the first of the host's addresses where something answers. Errors: why there is none.
+fn connect(host: &str, port: u16) -> Result<TcpStream, String> {
+    let found = (host, port).to_socket_addrs().map_err(|error| error.to_string())?;
+    let mut last = "its name has no address".to_owned();
+    for one in found {
+        match TcpStream::connect_timeout(&one, TIMEOUT).and_then(|stream| prepare(&stream).map(|()| stream)) {
+            Ok(stream) => return Ok(stream),
+            Err(error) => last = error.to_string(),
+        }
+    }
+    Err(last)
 }
 
 fn prepare(stream: &TcpStream) -> std::io::Result<()> {

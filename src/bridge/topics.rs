@@ -73,7 +73,7 @@ impl<'a> Topics<'a> {
                 continue;
             }
             // A command can be measured, and a measurement a command; an image is only an image.
-            if own.is_some_and(|own| (own == LiveRole::Image) == (role == LiveRole::Image)) {
+            if kind.is_some_and(|kind| kind.is_image() == (role == LiveRole::Image)) {
                 return Ok(Some(role));
             }
             let RobotChannel {
@@ -85,7 +85,8 @@ impl<'a> Topics<'a> {
             return Err(BridgeError::Topic(format!(
                 "the topic {topic} has messages of the type {schema_name:?} in {encoding:?}, which cannot be used for it; images are \
                  sensor_msgs/msg/Image or CompressedImage in cdr, or foxglove.RawImage or CompressedImage in protobuf or json; commands and \
-                 states are geometry_msgs/msg/Twist or TwistStamped, nav_msgs/msg/Odometry or sensor_msgs/msg/JointState in cdr"
+                 states are geometry_msgs/msg/Twist or TwistStamped, nav_msgs/msg/Odometry or sensor_msgs/msg/JointState in cdr or json, or \
+                 any other object with numbers in json"
             )));
         }
         let named = |role| match role {
@@ -161,6 +162,7 @@ fn number(values: &[LiveValue], channel: &ChannelScale) -> Result<f32, String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use foreframe_core::nn::Conditioning;
 
     fn channel(id: u64, topic: &str, schema_name: &str) -> RobotChannel {
         RobotChannel {
@@ -204,22 +206,58 @@ mod tests {
     }
 
     #[test]
+    fn an_object_in_json_is_used_for_what_its_topic_is_named_for() {
+        let spec = ModelSpec {
+            conditioning: Conditioning::Action,
+            actions: vec![scale("speed")],
+            ..ModelSpec::default()
+        };
+        let json = |topic: &str| RobotChannel {
+            encoding: "json".to_owned(),
+            ..channel(1, topic, "robot.Command")
+        };
+        let named = TopicNames {
+            action: Some("/command".to_owned()),
+            image: Some("/camera".to_owned()),
+            ..TopicNames::default()
+        };
+        let mut topics = Topics::new(&named, &spec);
+        assert_eq!(topics.choose(&json("/other")).unwrap(), None);
+        assert_eq!(topics.choose(&json("/command")).unwrap(), Some(LiveRole::Command));
+        let seen = topics
+            .read(LiveRole::Command, br#"{"speed":0.5,"mode":"auto"}"#)
+            .unwrap();
+        let action = Action::try_from(vec![0.5]).unwrap();
+        assert!(matches!(seen, Some(Seen::Action(found)) if found == action));
+        let error = topics.read(LiveRole::Command, br#"{"velocity":0.5}"#).err().unwrap();
+        assert!(
+            error
+                .to_string()
+                .contains("have no \"speed\", which the model takes; they have: velocity")
+        );
+        assert!(topics.choose(&json("/camera")).is_err(), "it is no image");
+    }
+
+    fn scale(name: &str) -> ChannelScale {
+        ChannelScale {
+            name: name.to_owned(),
+            unit: String::new(),
+            mean: 0.0,
+            std: 1.0,
+        }
+    }
+
+    #[test]
     fn channels_of_the_simulator_are_those_of_wheels() {
         let value = |name: &str, value| LiveValue {
             name: name.to_owned(),
             value,
         };
         let values = [value("linear.x", 0.5), value("angular.z", 0.25)];
-        let channel = |name: &str| ChannelScale {
-            name: name.to_owned(),
-            unit: String::new(),
-            mean: 0.0,
-            std: 1.0,
-        };
-        assert_eq!(number(&values, &channel("linear")), Ok(0.5));
-        assert_eq!(number(&values, &channel("angular.z")), Ok(0.25));
+        assert_eq!(number(&values, &scale("linear")), Ok(0.5));
+        assert_eq!(number(&values, &scale("angular.z")), Ok(0.25));
         assert!(
-            number(&values, &channel("throttle"))
+            number(&values, &scale("throttle"))
                 .unwrap_err()
                 .contains("they have: linear.x, angular.z")
         );

@@ -1,5 +1,6 @@
 //! `foreframe bridge`
 
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -10,7 +11,7 @@ use super::interrupt;
 use super::process::print_line;
 use super::settings::CommonArgs;
 use super::workspace::Workspace;
-use crate::bridge::{self, BridgeEvent, LiveStep, TopicNames};
+use crate::bridge::{self, BridgeEvent, LiveStep, RobotAddress, TopicNames};
 use foreframe_data::dataset::import::live::LiveRole;
 
 /// How often a line says how it goes.
@@ -21,14 +22,19 @@ const LINE_EVERY: Duration = Duration::from_secs(5);
 /// Subscribes the robot's camera and, if the model takes them, its command and odometry; predicts; and publishes on the robot, as messages
 /// of ROS 2: PREFIX/predicted (a CompressedImage: the last predicted frame, with the time that it is of), PREFIX/error (a Float64: mean
 /// squared error of what was predicted for the present frame) and `PREFIX/expected_error`. Images are `sensor_msgs/msg/Image` or
-/// CompressedImage in CDR, or `foxglove.RawImage` or CompressedImage. It ends when the robot closes the connection.
+/// CompressedImage in CDR, or `foxglove.RawImage` or CompressedImage. Commands and odometry are messages of ROS 2 in CDR or JSON; a topic
+/// that is named can also have any other object in JSON, whose numbers are found by the names of the model's channels. It ends when the robot closes the connection.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   foreframe bridge ws://192.168.1.20:8765 --model rooms
-  foreframe bridge ws://localhost:8765 --model mycar --image /camera/image_raw --state /odom")]
+  foreframe bridge ws://localhost:8765 --model mycar --image /camera/image_raw --state /odom
+  foreframe bridge wss://robot-7.local:8765 --model rooms --ca-certificate robot-7.pem")]
 pub(super) struct BridgeArgs {
-    /// The robot's address, as ws://HOST:PORT
+    /// The robot's address, as ws://HOST:PORT or wss://HOST:PORT
     address: String,
+    /// A PEM file with the certificates to trust for wss:// [default: those that the system trusts]
+    #[arg(long, value_name = "FILE")]
+    ca_certificate: Option<PathBuf>,
     /// The directory of a model, its name, or NAME@VERSION
     #[arg(long)]
     model: String,
@@ -59,8 +65,12 @@ pub(super) fn run(args: BridgeArgs) -> Result<(), CliError> {
     };
     let cancelled = interrupt::flag()?;
     let mut log = BridgeLog::default();
+    let address = RobotAddress {
+        url: args.address,
+        ca_certificate: args.ca_certificate,
+    };
     bridge::run(
-        &args.address,
+        &address,
         &names,
         &Arc::new(model),
         &mut |event| log.on_event(event),

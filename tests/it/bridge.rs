@@ -16,7 +16,7 @@ use crate::process::foreframe;
 use crate::service::{CONTEXT, HEIGHT, HORIZON, TIMEOUT, WIDTH, frame, model, spec};
 
 const PERIOD_NS: u64 = 200_000_000;
-const PROTOCOL: &str = "foxglove.sdk.v1";
+pub(crate) const PROTOCOL: &str = "foxglove.sdk.v1";
 
 /// The bridge as a process, and the robot that it has connected to.
 struct Robot {
@@ -222,10 +222,24 @@ fn what_cannot_be_used_is_named() {
         error.contains("/map has messages of the type \"nav_msgs/msg/OccupancyGrid\""),
         "{error}"
     );
-    for address in ["http://localhost:1", "wss://localhost:1", "robot"] {
+    for address in ["http://localhost:1", "robot"] {
         let refused = crate::process::output(dir.path(), &["bridge", address, "--model", "./moving"]);
         assert_eq!(refused.status.code(), Some(2), "{address}");
     }
     let silent = crate::process::output(dir.path(), &["bridge", "ws://127.0.0.1:1", "--model", "./moving"]);
     assert_eq!(silent.status.code(), Some(1));
+}
+
+#[cfg(not(feature = "tls"))]
+#[test]
+fn a_secure_address_needs_a_program_with_tls() {
+    let dir = tempfile::tempdir().unwrap();
+    model(dir.path(), "moving", spec(Conditioning::StateAction));
+    let refused = crate::process::output(dir.path(), &["bridge", "wss://127.0.0.1:1", "--model", "./moving"]);
+    let error = String::from_utf8_lossy(&refused.stderr);
+    assert_eq!(refused.status.code(), Some(2), "{error}");
+    assert!(
+        error.contains("built without TLS") && error.contains("--features tls"),
+        "{error}"
+    );
 }

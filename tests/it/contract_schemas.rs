@@ -179,7 +179,7 @@ fn every_example_in_asyncapi_fits_its_schema() {
         }
     }
     assert_none(&mismatches);
-    assert_eq!(messages.len(), 13);
+    assert_eq!(messages.len(), 14);
 }
 
 /// The bodies that the documents send with curl: path and JSON.

@@ -272,6 +272,35 @@ fn an_error_names_the_path_in_the_archive() {
     }
 }
 
+/// One item that the list of images shows, and one that only decoding shows.
+#[test]
+fn what_is_left_out_is_named_as_in_the_archive() {
+    let dir = tempfile::tempdir().unwrap();
+    let walk = folder(dir.path());
+    fs::write(walk.join("2.png"), b"no image").unwrap();
+    fs::remove_file(walk.join("9.png")).unwrap();
+    let files = contents(&walk, "walk/");
+    let packed: Vec<(&str, &[u8])> = files.iter().map(|(name, bytes)| (name.as_str(), &bytes[..])).collect();
+    let (archive, set) = (dir.path().join("drive.zip"), dir.path().join("set"));
+    fs::write(&archive, zip(&packed)).unwrap();
+    let options = ImportOptions {
+        skip_bad: true,
+        ..small()
+    };
+    let skipped = run(&archive, &set, options).unwrap().skipped;
+    let inside = archive.join("walk");
+    let csv = inside.join("log.csv").display().to_string();
+    let of_line = |line: &str| skipped.iter().find(|item| item.place == format!("{csv} {line}"));
+    assert!(of_line("line 11").unwrap().reason.contains("is missing"), "{skipped:?}");
+    let damaged = &of_line("line 4").unwrap().reason;
+    assert!(
+        damaged.starts_with(&*inside.join("2.png").to_string_lossy()),
+        "{damaged}"
+    );
+    let listed = fs::read_to_string(set.join("meta/skipped.json")).unwrap();
+    assert_eq!((skipped.len(), listed.contains(".unpacked")), (2, false), "{listed}");
+}
+
 #[test]
 fn damaged_archives_are_refused() {
     let whole = tar(&[file("1.png", &[7; 3000])]);

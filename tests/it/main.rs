@@ -9,6 +9,8 @@ mod backup;
 mod bag_files;
 mod bags;
 mod bridge;
+#[cfg(feature = "tls")]
+mod bridge_tls;
 mod browser;
 mod calibration;
 mod cli;
@@ -112,6 +114,7 @@ mod store_objects;
 mod store_parts;
 mod stream;
 mod stream_accuracy;
+mod stream_plans;
 #[cfg(feature = "tls")]
 mod tls;
 mod training;

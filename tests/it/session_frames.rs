@@ -27,6 +27,7 @@ async fn on_gap_skip_accepts_a_gap_and_reports_it() {
         on_late: None,
         format: Some(ImageFormat::Png),
         resize: None,
+        ..ConfigureMessage::default()
     });
     let configured = ServerMessage::Configured(SessionSettings {
         on_gap: OnGap::Skip,

@@ -21,13 +21,13 @@ use tokio_tungstenite::tungstenite::Message;
 use crate::service::{InProcessServer, TIMEOUT, app, poll_until, run};
 
 /// A directory with a certificate, its key, and a server's settings that name them.
-struct CertificateDir {
+pub(crate) struct CertificateDir {
     dir: tempfile::TempDir,
 }
 
 impl CertificateDir {
     /// None without `openssl`.
-    fn new() -> Option<Self> {
+    pub(crate) fn new() -> Option<Self> {
         if Command::new("openssl").arg("version").output().is_err() {
             println!("skipped: openssl is not installed");
             return None;
@@ -38,7 +38,7 @@ impl CertificateDir {
         Some(own)
     }
 
-    fn path(&self, name: &str) -> PathBuf {
+    pub(crate) fn path(&self, name: &str) -> PathBuf {
         self.dir.path().join(name)
     }
 

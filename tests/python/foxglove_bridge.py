@@ -1,6 +1,8 @@
 """`foreframe bridge` with a robot that the Foxglove SDK plays.
 
-    foxglove_bridge.py PROGRAM MODELS FRAMES
+    foxglove_bridge.py PROGRAM MODELS FRAMES [CERTIFICATE KEY]
+
+With a certificate and its key as PEM files, the robot speaks wss://, for which the program needs the feature tls.
 """
 
 import base64
@@ -78,24 +80,70 @@ def json_image(path, compressed):
     return json.dumps({"timestamp": {"sec": 0, "nsec": 0}, "frame_id": "camera", "data": data, **own}).encode()
 
 
-def drive(program, models, frames, compressed, as_json):
+class CdrRobot:
+    """Commands and odometry as a robot with ROS 2 has them. Only the names of the schemas count for the bridge."""
+
+    encoding, arguments = "cdr", []
+    schemas = {"encoding": "ros2msg", "data": b""}
+    command, state = "geometry_msgs/msg/Twist", "nav_msgs/msg/Odometry"
+    twist, odometry = staticmethod(twist), staticmethod(odometry)
+
+
+def speeds(linear, angular):
+    return {"linear": {"x": linear, "y": 0, "z": 0}, "angular": {"x": 0, "y": 0, "z": angular}}
+
+
+class JsonRosRobot(CdrRobot):
+    """The same in JSON."""
+
+    encoding, schemas = "json", {"encoding": "jsonschema", "data": b"{}"}
+
+    @staticmethod
+    def twist(linear, angular):
+        return json.dumps(speeds(linear, angular)).encode()
+
+    @staticmethod
+    def odometry(x, y, cos, sin, linear, angular):
+        heading = numpy.arctan2(sin, cos)
+        pose = {"position": {"x": x, "y": y, "z": 0}, "orientation": {"x": 0, "y": 0, "z": numpy.sin(heading / 2), "w": numpy.cos(heading / 2)}}
+        return json.dumps({"header": {}, "pose": {"pose": pose}, "twist": {"twist": speeds(linear, angular)}}).encode()
+
+
+class OwnJsonRobot(JsonRosRobot):
+    """JSON with types and names of its own, for which the topics are named."""
+
+    command, state = "robot.Command", "robot.State"
+    arguments = ["--action", "/cmd_vel", "--state", "/odom"]
+
+    @staticmethod
+    def twist(linear, angular):
+        return json.dumps({"timestamp": {"sec": 0, "nsec": 0}, "linear": linear, "angular": angular, "mode": "auto"}).encode()
+
+    @staticmethod
+    def odometry(*values):
+        return json.dumps(dict(zip(["x", "y", "heading_cos", "heading_sin", "linear", "angular"], values))).encode()
+
+
+def drive(robot, compressed, as_json):
     """Plays the recorded frames as a robot, and compares what the bridge says of them."""
+    program, models, frames = sys.argv[1], sys.argv[2], pathlib.Path(sys.argv[3])
+    tls = [pathlib.Path(path) for path in sys.argv[4:6]]
     listener = Listener()
     context = foxglove.Context()
+    identity = {"tls_cert": tls[0].read_bytes(), "tls_key": tls[1].read_bytes()} if tls else {}
     server = foxglove.start_server(
-        name="test robot", port=0, capabilities=[Capability.ClientPublish], supported_encodings=["cdr"], server_listener=listener, context=context
+        name="test robot", port=0, capabilities=[Capability.ClientPublish], supported_encodings=["cdr"], server_listener=listener, context=context, **identity
     )
     if as_json:
         schema = Schema(name="foxglove." + ("CompressedImage" if compressed else "RawImage"), encoding="jsonschema", data=b"{}")
         camera = Channel("/camera", schema=schema, message_encoding="json", context=context)
     else:
         camera = (CompressedImageChannel if compressed else RawImageChannel)("/camera", context=context)
-    # Only the names count for the bridge.
-    ros = lambda name: Schema(name=name, encoding="ros2msg", data=b"")
-    command = Channel("/cmd_vel", schema=ros("geometry_msgs/msg/Twist"), message_encoding="cdr", context=context)
-    odom = Channel("/odom", schema=ros("nav_msgs/msg/Odometry"), message_encoding="cdr", context=context)
+    command = Channel("/cmd_vel", schema=Schema(name=robot.command, **robot.schemas), message_encoding=robot.encoding, context=context)
+    odom = Channel("/odom", schema=Schema(name=robot.state, **robot.schemas), message_encoding=robot.encoding, context=context)
+    address = [f"wss://localhost:{server.port}", "--ca-certificate", str(tls[0])] if tls else [f"ws://127.0.0.1:{server.port}"]
     bridge = subprocess.Popen(
-        [program, "bridge", f"ws://127.0.0.1:{server.port}", "--model", "moving-flow", "--models-dir", models], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [program, "bridge", *address, "--model", "moving-flow", "--models-dir", models, *robot.arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
     lines = [bridge.stdout.readline().strip() for _ in range(4)]
     assert lines[0] == 'connected to "test robot"' and sorted(lines[1:]) == ["action: /cmd_vel", "image: /camera", "state: /odom"], lines
@@ -109,8 +157,8 @@ def drive(program, models, frames, compressed, as_json):
         now_ns = start_ns + int(index * PERIOD_S * 1e9)
         seen.append(numpy.asarray(Image.open(path).convert("L")))
         height, width = seen[-1].shape
-        command.log(twist(*recorded["actions"][index]), log_time=now_ns)
-        odom.log(odometry(*recorded["states"][index]), log_time=now_ns)
+        command.log(robot.twist(*recorded["actions"][index]), log_time=now_ns)
+        odom.log(robot.odometry(*recorded["states"][index]), log_time=now_ns)
         image = CompressedImage(data=path.read_bytes(), format="png") if compressed else RawImage(width=width, height=height, encoding="mono8", step=width, data=seen[-1].tobytes())
         camera.log(json_image(path, compressed) if as_json else image, log_time=now_ns)
         predictions = max(0, index + 1 - HORIZON + 1)
@@ -125,7 +173,7 @@ def drive(program, models, frames, compressed, as_json):
         assert abs(error - own) < 1e-6, (error, own)
     listener.wait(lambda: len(listener.of("/foreframe/expected_error")) == len(predicted), "the last expected error")
     mean, still = numpy.mean(errors), numpy.mean([numpy.mean((old / 255.0 - new / 255.0) ** 2) for old, new in zip(seen[HORIZON - 1 :], truth)])
-    print(f"{'compressed' if compressed else 'raw'} images in {'JSON' if as_json else 'Protocol Buffers'}: {len(predicted)} predictions, mean error {mean:.4f}; that of the last frame {still:.4f}")
+    print(f"{robot.__name__}, {'compressed' if compressed else 'raw'} images in {'JSON' if as_json else 'Protocol Buffers'}: {len(predicted)} predictions, mean error {mean:.4f}; that of the last frame {still:.4f}")
     assert mean < still
     server.stop()
     assert bridge.wait(timeout=30) == 1, bridge.stderr.read()
@@ -133,4 +181,6 @@ def drive(program, models, frames, compressed, as_json):
 
 for as_json in (False, True):
     for compressed in (True, False):
-        drive(sys.argv[1], sys.argv[2], pathlib.Path(sys.argv[3]), compressed, as_json)
+        drive(CdrRobot, compressed, as_json)
+for robot in (JsonRosRobot, OwnJsonRobot):
+    drive(robot, True, True)

@@ -125,6 +125,7 @@ pub(crate) async fn until(http: &mut Http, path: &str, holds: impl Fn(&Value) ->
 /// The 99th percentiles of health checks and of streams in milliseconds, and the faults.
 async fn measure(args: &HealthArgs, server: &Server, workload: &Arc<Workload>) -> (f64, f64, Vec<String>) {
     let load = RobotLoad {
+        plan_samples: None,
         sessions: args.sessions,
         mode: SendMode::Scheduled(args.rate_hz),
         on_late: OnLate::Predict,

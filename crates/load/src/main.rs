@@ -11,6 +11,7 @@ mod health;
 mod http;
 #[path = "../../../tests/malformed/mutation.rs"]
 mod mutation;
+mod plans;
 mod previews;
 mod process_usage;
 mod project;
@@ -64,6 +65,8 @@ enum Scenario {
     Churn(churn::ChurnArgs),
     /// Predictions while other clients ask for pictures: measure latencies
     Previews(previews::PreviewsArgs),
+    /// Robots that plan with every prediction, beside robots that only stream: measure latencies
+    Plans(plans::PlansArgs),
     /// Health checks and streams while a training uses every core: measure latencies
     Health(health::HealthArgs),
     /// Everything at once, with hostile clients, kills, a full disk and a database that is away: check that nothing
@@ -72,13 +75,14 @@ enum Scenario {
 }
 
 /// The scenarios as CI runs them. CI machines are busy, so the bounds on latencies are wide.
-const SHORT_FORMS: [&str; 7] = [
+const SHORT_FORMS: [&str; 8] = [
     "stream --sessions 4 --seconds 2 --warm-up-s 0.5 --p99-ms 1000",
     "saturate --peak-s 1 --seconds 4 --goodput-share 0.3 --growth-mib 40 --sessions 32",
     "saturate --over streams --skip-late --late-p99-ms 1000 --peak-s 1 --seconds 3 --growth-mib 40 --sessions 32",
     "slow-reader --rounds 1 --seconds 2 --warm-up-s 0.5 --noise-ms 1000 --growth-mib 40",
     "churn --sessions 300 --requests 3000 --growth-mib 40",
     "previews --rounds 1 --seconds 2 --noise-ms 1000",
+    "plans --seconds 2 --warm-up-s 0.5 --p99-ms 1000",
     "health --seconds 3 --livez-p99-ms 1000 --p99-ms 1000",
 ];
 
@@ -115,6 +119,7 @@ async fn run(scenario: &Scenario, bounds: &mut Bounds) {
         Scenario::SlowReader(args) => slow_reader::run(args, bounds).await,
         Scenario::Churn(args) => churn::run(args, bounds).await,
         Scenario::Previews(args) => previews::run(args, bounds).await,
+        Scenario::Plans(args) => plans::run(args, bounds).await,
         Scenario::Health(args) => health::run(args, bounds).await,
         Scenario::Endurance(args) => endurance::run(args, bounds).await,
     }

@@ -26,9 +26,12 @@ pub(crate) struct FrameCounts {
     /// Predictions that the server dropped because this client read too slowly.
     pub(crate) dropped: u64,
     pub(crate) answers: Vec<PredictionTimes>,
+    pub(crate) plans: Vec<PredictionTimes>,
+    /// Plans that were due while another one was searched for.
+    pub(crate) plans_skipped: u64,
 }
 
-/// A prediction.
+/// A prediction, or a plan.
 #[derive(Clone, Copy)]
 pub(crate) struct PredictionTimes {
     /// When its frame was scheduled.
@@ -37,7 +40,7 @@ pub(crate) struct PredictionTimes {
     pub(crate) sent: Instant,
     /// When the prediction was received.
     pub(crate) received: Instant,
-    /// Time that the model computed.
+    /// Time that the model computed, or that the search took.
     pub(crate) compute: Duration,
 }
 
@@ -57,6 +60,8 @@ impl FrameCounts {
         self.refused += other.refused;
         self.dropped += other.dropped;
         self.answers.extend(other.answers);
+        self.plans.extend(other.plans);
+        self.plans_skipped += other.plans_skipped;
         self.first_refusal = self.first_refusal.take().or(other.first_refusal);
     }
 }
@@ -100,6 +105,19 @@ pub(crate) async fn run(
                         compute,
                     });
                     counts.dropped += dropped;
+                }
+                ServerMessage::Plan {
+                    seq, answer, skipped, ..
+                } => {
+                    let (scheduled, sent) = log.lock().unwrap()[seq as usize];
+                    counts.plans.push(PredictionTimes {
+                        scheduled,
+                        sent,
+                        received,
+                        compute: answer.time(),
+                    });
+                    counts.plans_skipped += skipped;
+                    continue;
                 }
                 ServerMessage::Buffering { .. } => counts.buffering += 1,
                 ServerMessage::Overtaken { .. } => counts.overtaken += 1,

@@ -37,6 +37,8 @@ pub(crate) enum SendMode {
 #[derive(Clone, Copy)]
 pub(crate) struct RobotLoad {
     pub(crate) sessions: usize,
+    /// With it, each robot asks for a plan with every prediction, chosen from so many.
+    pub(crate) plan_samples: Option<usize>,
     pub(crate) mode: SendMode,
     /// What the server does with frames that newer ones have overtaken.
     pub(crate) on_late: OnLate,
@@ -63,7 +65,11 @@ impl RobotLoad {
         for _ in 0..self.sessions {
             let session = Session::open(&mut http, workload.model(), self.on_late).await;
             let socket = session::connect(server.address, &session.stream_path()).await;
-            sockets.push(socket.expect("the stream opens"));
+            let mut socket = socket.expect("the stream opens");
+            if let Some(samples) = self.plan_samples {
+                session::ask_for_plans(&mut socket, samples).await;
+            }
+            sockets.push(socket);
             sessions.push(session);
         }
         let begin = Instant::now() + START_DELAY;
@@ -158,10 +164,19 @@ impl RobotLoad {
 impl RobotLoadResult {
     /// Latencies of the predictions whose frames were scheduled in the measured time.
     pub(crate) fn latencies(&self, of: impl Fn(&PredictionTimes) -> Duration) -> Latencies {
-        let counted = self.counts.answers.iter();
+        self.measured(&self.counts.answers, of)
+    }
+
+    /// Latencies of the plans from the schedule of their frames, in the measured time.
+    pub(crate) fn plans_since_schedule(&self) -> Latencies {
+        self.measured(&self.counts.plans, |plan| plan.received - plan.scheduled)
+    }
+
+    fn measured(&self, times: &[PredictionTimes], of: impl Fn(&PredictionTimes) -> Duration) -> Latencies {
+        let counted = times.iter();
         Latencies::of(
             counted
-                .filter(|answer| (self.from..self.to).contains(&answer.scheduled))
+                .filter(|time| (self.from..self.to).contains(&time.scheduled))
                 .map(of),
         )
     }

@@ -5,8 +5,8 @@ use std::net::SocketAddr;
 use std::time::Instant;
 
 use axum::http::HeaderValue;
-use foreframe::server::protocol::{Codec, OnLate, ServerMessage};
-use futures_util::StreamExt as _;
+use foreframe::server::protocol::{ClientMessage, Codec, ConfigureMessage, OnLate, ServerMessage};
+use futures_util::{SinkExt as _, StreamExt as _};
 use serde_json::json;
 use tokio::net::TcpStream;
 use tokio::time::timeout;
@@ -16,6 +16,7 @@ use tokio_tungstenite::tungstenite::protocol::WebSocketConfig;
 use tokio_tungstenite::tungstenite::{Error, Message};
 
 use crate::http::{self, Http, Request, Response, TIMEOUT};
+use crate::workload;
 
 /// Size of the read buffer: larger than an answer, but small, because it is zeroed before every read.
 const READ_BYTES: usize = 32 << 10;
@@ -80,6 +81,23 @@ pub(crate) async fn ready(socket: &mut Socket) -> Result<u64, Box<Error>> {
         Some(ServerMessage::Ready { next_seq, .. }) => Ok(next_seq),
         _ => Err(Box::new(Error::Io(io::ErrorKind::InvalidData.into()))),
     }
+}
+
+/// Asks for a plan with every prediction, chosen from so many plans.
+pub(crate) async fn ask_for_plans(socket: &mut Socket, samples: usize) {
+    let request =
+        json!({"goal": {"position_m": [0.5, 0.1]}, "search": {"solver": {"samples": samples, "iterations": 1}}});
+    let configure = ClientMessage::Configure(ConfigureMessage {
+        plan_every: Some(1),
+        plan_request: serde_json::from_value(request).expect("a request for plans"),
+        ..ConfigureMessage::default()
+    });
+    socket
+        .send(workload::message(&configure))
+        .await
+        .expect("the stream is open");
+    let answer = receive(socket).await;
+    assert!(matches!(answer, Some(ServerMessage::Configured(_))), "{answer:?}");
 }
 
 /// How a stream is opened.

@@ -101,6 +101,7 @@ pub(crate) async fn run(args: &SlowReaderArgs, bounds: &mut Bounds) {
 
 async fn round(args: &SlowReaderArgs, server: &Server, workload: &Arc<Workload>) -> Round {
     let load = RobotLoad {
+        plan_samples: None,
         sessions: args.sessions,
         mode: SendMode::Scheduled(args.rate_hz),
         on_late: OnLate::Predict,

@@ -72,6 +72,7 @@ pub(crate) async fn run(args: &StreamArgs, bounds: &mut Bounds) {
 impl StreamArgs {
     fn load(&self, sessions: usize) -> RobotLoad {
         RobotLoad {
+            plan_samples: None,
             sessions,
             mode: SendMode::Scheduled(self.rate_hz),
             on_late: OnLate::Predict,

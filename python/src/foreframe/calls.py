@@ -167,6 +167,7 @@ def plan(
     action: Vector | None,
     resize: str | None,
     camera: Camera | None,
+    with_obstacles: bool,
     search: Mapping[str, Any],
 ) -> Call[Plan]:
     image_format, images = encode_all(frames, spec.size)
@@ -182,6 +183,7 @@ def plan(
         camera=camera and camera.body(),
         search=_search(search),
         with_frames=True,
+        with_obstacles=with_obstacles,
     )
     return Call("POST", path("models", name, "plan"), partial(Plan.of, size=spec.size), body, is_binary=True)
 
@@ -195,19 +197,26 @@ def session_plan(
     state: Vector | None,
     present: Vectors | None,
     action: Vector | None,
+    with_obstacles: bool,
     search: Mapping[str, Any],
 ) -> Call[Plan]:
-    body = given(
-        format="raw",
-        goal=goal.body(spec.size, "raw"),
-        state=numbers(state),
-        present=numbers(present),
-        action=numbers(action),
-        search=_search(search),
-        with_frames=True,
-    )
+    body = {
+        **session_plan_body(spec, goal, with_obstacles, search),
+        **given(state=numbers(state), present=numbers(present), action=numbers(action)),
+    }
     read, headers = partial(Plan.of, size=spec.size), {"x-session-token": token}
     return Call("POST", path("sessions", session, "plan"), read, body, headers=headers, is_binary=True)
+
+
+def session_plan_body(spec: Spec, goal: Goal, with_obstacles: bool, search: Mapping[str, Any]) -> dict[str, Any]:
+    """What the plans of a session are asked for with."""
+    return given(
+        format="raw",
+        goal=goal.body(spec.size, "raw"),
+        search=_search(search),
+        with_frames=True,
+        with_obstacles=with_obstacles,
+    )
 
 
 def _search(search: Mapping[str, Any]) -> Mapping[str, Any] | None:

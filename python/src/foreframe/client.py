@@ -200,11 +200,13 @@ class Client:
         action: Vector | None = None,
         resize: str | None = None,
         camera: Camera | None = None,
+        with_obstacles: bool = False,
         **search: Any,
     ) -> Plan:
         """Searches for the plan that reaches ``goal`` best, from a context.
 
         ``present``: the plan that the robot follows now, one of the candidates. ``action``: the action before the plan.
+        ``with_obstacles``: whether the answer has what stands in the way, and where movers will be.
         ``search``: what is not the default, by keyword: ``solver`` (``random-shooting``, ``cem`` or ``mppi``), ``samples``,
         ``iterations``, ``seed``, ``budget_ms``, ``costs`` (weights by name), ``limits`` (for each action channel ``low``, ``high`` and
         maybe ``max_change``), ``steps``, ``finalists``, ``radius_m``, ``margin_m``, ``robot_height_m``. If no plan is safe, the plan is
@@ -221,6 +223,7 @@ class Client:
             action=action,
             resize=resize,
             camera=camera,
+            with_obstacles=with_obstacles,
             search=search,
         )
         return self._follow(self._specs.predicted(model, call))
@@ -482,6 +485,7 @@ class AsyncClient:
         action: Vector | None = None,
         resize: str | None = None,
         camera: Camera | None = None,
+        with_obstacles: bool = False,
         **search: Any,
     ) -> Plan:
         """As :meth:`Client.plan`."""
@@ -496,6 +500,7 @@ class AsyncClient:
             action=action,
             resize=resize,
             camera=camera,
+            with_obstacles=with_obstacles,
             search=search,
         )
         return await self._follow(self._specs.predicted(model, call))

@@ -206,6 +206,23 @@ class Goal:
 
 
 @dataclass(frozen=True)
+class Obstacles:
+    """What the robot would touch: places in metres ahead and to the left of it now, in cells of 5 cm."""
+
+    #: ``[cells, 2]``: what stands.
+    fixed_m: Floats
+    #: Each ``[cells, 2]``: movers now, then after each predicted step; empty if the model does not find movers.
+    movers_m: tuple[Floats, ...]
+
+    @classmethod
+    def of(cls, body: Mapping[str, Any]) -> Obstacles:
+        def cells(places: Sequence[Sequence[float]]) -> Floats:
+            return np.asarray(places, np.float32).reshape(-1, 2)
+
+        return cls(fixed_m=cells(body["fixed_m"]), movers_m=tuple(cells(places) for places in body["movers_m"]))
+
+
+@dataclass(frozen=True)
 class PlannedActions:
     """A plan with what is expected under it."""
 
@@ -254,6 +271,8 @@ class Plan(PlannedActions):
     #: Whether the way was checked against what the model's depth network sees in the last frame, and against where movers will
     #: be, if it finds them.
     clearance_checked: bool
+    #: What stands in the way; None unless it was asked for (``with_obstacles``) and checked.
+    obstacles: Obstacles | None
     novelty: float | None
     #: Plans that were judged, and those whose frames were predicted.
     samples: int
@@ -273,11 +292,23 @@ class Plan(PlannedActions):
             safe=body["safe"],
             reason=body.get("reason"),
             clearance_checked=body["clearance_checked"],
+            obstacles=Obstacles.of(body["obstacles"]) if "obstacles" in body else None,
             novelty=body.get("novelty"),
             samples=body["samples"],
             predicted=body["predicted"],
             time_ms=body["time_ms"],
         )
+
+
+@dataclass(frozen=True)
+class FramePlan:
+    """A plan that the server searched for beside the predictions of a session (``Session.plan_every``)."""
+
+    #: The number of the frame from which it was searched for.
+    seq: int
+    plan: Plan
+    #: Plans that were due since the last one, but skipped, because the search before had not ended or the server was busy.
+    skipped: int
 
 
 @dataclass(frozen=True)
@@ -295,6 +326,8 @@ class Answer:
     need: int
     #: Whether the server had lost the session, so that the last frames were sent again before this one.
     replayed: bool = False
+    #: The newest plan that came since the answer before; None if none came, or ``plan_every`` was not called.
+    plan: FramePlan | None = None
 
 
 @dataclass(frozen=True)

@@ -110,13 +110,25 @@ class Session:
         state: Vector | None = None,
         present: Vectors | None = None,
         action: Vector | None = None,
+        with_obstacles: bool = False,
         **search: Any,
     ) -> Plan:
         """Searches for the plan that reaches ``goal`` best, from the last frame. See :meth:`Client.plan`.
 
         ``present`` is by default the plan of the last frame.
         """
-        return self._run(self._flow.plan(goal, state, present, action, search))
+        return self._run(self._flow.plan(goal, state, present, action, with_obstacles, search))
+
+    def plan_every(
+        self, frames: int, goal: Goal | None = None, *, with_obstacles: bool = False, **search: Any
+    ) -> None:
+        """Asks for a plan with every so many predictions, from the next one on; 0: for none.
+
+        The server searches beside the predictions, which do not wait; ``step`` gives the newest plan as ``answer.plan``, often of
+        the frame before. ``goal`` is relative to the robot at the frame of each plan: call this again as the robot moves.
+        ``search``: see :meth:`Client.plan`. Raises StreamError if a goal or a setting does not fit the model.
+        """
+        self._run(self._flow.plan_every(frames, goal, with_obstacles, search))
 
     def close(self) -> None:
         """Ends the session."""
@@ -218,10 +230,17 @@ class AsyncSession:
         state: Vector | None = None,
         present: Vectors | None = None,
         action: Vector | None = None,
+        with_obstacles: bool = False,
         **search: Any,
     ) -> Plan:
         """As :meth:`Session.plan`."""
-        return await self._run(self._flow.plan(goal, state, present, action, search))
+        return await self._run(self._flow.plan(goal, state, present, action, with_obstacles, search))
+
+    async def plan_every(
+        self, frames: int, goal: Goal | None = None, *, with_obstacles: bool = False, **search: Any
+    ) -> None:
+        """As :meth:`Session.plan_every`."""
+        await self._run(self._flow.plan_every(frames, goal, with_obstacles, search))
 
     async def close(self) -> None:
         """Ends the session."""

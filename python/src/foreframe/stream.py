@@ -15,7 +15,7 @@ from . import calls
 from .calls import Call, Plans, Vector, Vectors, given, numbers
 from .errors import ApiError, ConnectionFailed, StreamClosed, StreamError, Unavailable
 from .images import FrameLike, encode
-from .records import Answer, Camera, Goal, Plan, Prediction, Rollouts, Spec
+from .records import Answer, Camera, FramePlan, Goal, Plan, Prediction, Rollouts, Spec
 
 T = TypeVar("T")
 
@@ -95,6 +95,10 @@ class SessionFlow:
         #: The number of the frame that the server counts as 0.
         self._first_seq = 0
         self._replayed = False
+        #: What the server was told of plans; sent again to a new stream.
+        self._plans: dict[str, Any] | None = None
+        #: The newest plan that came since the last answer.
+        self._newest_plan: Mapping[str, Any] | None = None
         #: The last frames that were answered.
         self._context: deque[dict[str, Any]] = deque()
 
@@ -150,16 +154,46 @@ class SessionFlow:
         state: Vector | None,
         present: Vectors | None,
         action: Vector | None,
+        with_obstacles: bool,
         search: Mapping[str, Any],
     ) -> Flow[Plan]:
         """The Plan from the last frame."""
 
         def call(spec: Spec) -> Call[Plan]:
             return calls.session_plan(
-                *self.identity, spec, goal, state=state, present=present, action=action, search=search
+                *self.identity,
+                spec,
+                goal,
+                state=state,
+                present=present,
+                action=action,
+                with_obstacles=with_obstacles,
+                search=search,
             )
 
         return self._asked(call)
+
+    def plan_every(
+        self, frames: int, goal: Goal | None, with_obstacles: bool, search: Mapping[str, Any]
+    ) -> Flow[None]:
+        """Asks for a plan with every so many predictions; 0: for none."""
+        if frames < 0 or (frames > 0 and goal is None):
+            raise ValueError(f"plan_every is {frames}, and the goal {goal}; give 1 or more with a goal, or 0")
+        yield from self.open()
+        assert self.spec is not None
+        plans: dict[str, Any] = {"plan_every": frames}
+        if goal is not None:
+            plans["plan_request"] = calls.session_plan_body(self.spec, goal, with_obstacles, search)
+        before, self._plans = self._plans, plans
+        try:
+            yield from self._configure_plans()
+        except Broken:
+            # A new stream is told of them when it is opened.
+            self._is_open = False
+            yield from self.open()
+        except StreamError:
+            self._plans = before
+            raise
 
     def close(self) -> Flow[None]:
         """Ends the session on the server, if it can be reached."""
@@ -226,6 +260,8 @@ class SessionFlow:
 
     def _receive(self) -> Flow[Mapping[str, Any]]:
         answer: dict[str, Any] = msgpack.unpackb((yield Receive()))
+        if answer["type"] == "plan":
+            self._newest_plan = answer
         if answer["type"] == "closing":
             self._is_open = False
             yield Shut()
@@ -261,6 +297,8 @@ class SessionFlow:
         except ConnectionFailed as error:
             raise Broken(str(error)) from error
         self._id, self._token = created["id"], created["token"]
+        # Its frame has another number now.
+        self._newest_plan = None
         try:
             yield from self._open_socket()
         except ApiError as error:
@@ -284,7 +322,18 @@ class SessionFlow:
             raise Broken(error.detail, error.retry_after_s) from error
         ready = yield from self._receive()
         self.spec, self.version = Spec.of(ready["spec"]), ready["version"]
+        if self._plans is not None:
+            yield from self._configure_plans()
         return ready
+
+    def _configure_plans(self) -> Flow[None]:
+        yield Send(msgpack.packb({"type": "configure", **(self._plans or {})}))
+        while True:
+            answer = yield from self._receive()
+            if answer["type"] == "configured":
+                return
+            if answer["type"] == "error":
+                raise StreamError(answer["code"], answer["detail"])
 
     def _wait(self, error: Broken, deadline: float, pause: float) -> Flow[float]:
         seconds = max(pause, error.retry_after_s)
@@ -300,6 +349,11 @@ class SessionFlow:
             known = {**answer, "model": self._model, "version": self.version}
             prediction = Prediction.of(known, self.spec.size)
         need = self.spec.context
+        newest, self._newest_plan = self._newest_plan, None
+        plan = None
+        if newest is not None:
+            found = Plan.of(newest["answer"], self.spec.size)
+            plan = FramePlan(newest["seq"] + self._first_seq, found, newest["skipped"])
         return Answer(
             seq=answer["seq"] + self._first_seq,
             timestamp_us=answer["timestamp_us"],
@@ -307,6 +361,7 @@ class SessionFlow:
             have=answer.get("have", need),
             need=need,
             replayed=self._replayed,
+            plan=plan,
         )
 
 

@@ -146,7 +146,7 @@ function Before({ robot, note }) {
   return html`<h2>The next ${ahead_s(spec.horizon - 1)} s, as a dream would begin now</h2>
     <div class="strip" style=${{ "--count": spec.horizon }}>${Array.from({ length: spec.horizon }, (_, step) => html`
       <${Picture} image=${frames[step]} caption=${`+${ahead_s(step)} s`} label=${`imagined for +${ahead_s(step)} s`} note=${frames.length ? "" : note} />`)}</div>
-    <p class="quiet">A model predicts ${spec.horizon} frames. In a dream it takes its own first frame for the camera's, predicts again, and so on, for as long as you like: its mistakes add up. The picture on the right shows what really happens meanwhile, and a line how far both are apart.</p>`;
+    <p class="quiet">A model predicts ${spec.horizon} frames. In a dream it takes its own first frame for the camera's, predicts again, and so on, for as long as you like: its mistakes add up. The picture on the right shows what really happens meanwhile, and a plot shows how far they are apart.</p>`;
 }
 
 const DRIFT_LINES = [{ label: "error", color: "--orange", width: 2 }];

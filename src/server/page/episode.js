@@ -86,11 +86,12 @@ export function Episode({ dataset, number, models, parameters }) {
   return html`<div>
     <div class="player">
       <div>
-        <div class=${model ? "two" : ""}>
+        <div class=${model ? "three" : ""}>
           <${Picture} image=${frame} caption="recorded" label=${`frame ${at}`} />
           ${[[model, first], [other, second]].map(([one, moments]) => one && html`<${Picture} image=${moments[at]?.predicted ?? frame} dim=${!moments[at]?.predicted}
-            note=${moments[at]?.predicted ? "" : moments.length <= at ? "predicting" : "no prediction yet"} caption=${one.name} label=${`what ${one.name} predicted for frame ${at}`} />`)}
-          ${model && !other && html`<${Picture} image=${first[at]?.predicted && frame} other=${first[at]?.predicted} caption="the difference" label="the difference" />`}
+            note=${moments[at]?.predicted ? "" : moments.length <= at ? "predicting" : "no prediction yet"} caption=${`predicted by ${one.name}`} label=${`what ${one.name} predicted for frame ${at}`} />`)}
+          ${model && !other && html`<${Picture} image=${first[at]?.predicted && frame} other=${first[at]?.predicted} caption="the difference" label="the difference" />
+            <p class="key"><span><i class="brighter" /> recorded is brighter</span> <span><i class="darker" /> recorded is darker</span></p>`}
         </div>
         <${Controls} player=${player} count=${data.frames.length} />
         <p class="quiet">frame ${at} of ${data.frames.length}, ${(data.times_s[at] ?? 0).toFixed(1)} s${data.frame_count > data.frames.length ? `; the first ${data.frames.length} of ${data.frame_count} frames` : ""}</p>
@@ -158,7 +159,7 @@ function ErrorLane({ moments, models, player }) {
   const series = [{ label: `best simple guess: ${GUESSES[best]}`, color: "--quiet", dash: [4, 4], width: 1 }, ...models.filter(Boolean).map(({ name }, place) => ({ label: name, color: ["--orange", "--violet"][place], width: 2 }))];
   const worst = data[2].reduce((found, value, at) => (value > (data[2][found] ?? -1) ? at : found), 0);
   return html`<h2>Error of the prediction <button class="small" disabled=${data[2][worst] == null} onClick=${() => player.jump(worst)}>jump to the worst</button></h2>
-    <${Plot} label="error of the prediction for each frame" data=${data} series=${series} height=${130} y="gray levels" sync="episode" mark=${player.at} onPick=${player.jump} legend />`;
+    <${Plot} label="error of the prediction for each frame" data=${data} series=${series} height=${130} x="frame" y="gray levels" sync="episode" mark=${player.at} onPick=${player.jump} legend />`;
 }
 
 // Channels of one unit share a plot.

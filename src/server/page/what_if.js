@@ -101,7 +101,7 @@ export function WhatIf({ robot }) {
       <button class=${`plan ${place === best && plans.length ? "best" : ""}`} disabled=${!plans.length || is_moving || !robot.is_drivable} onClick=${() => take(plan)}>
         <h3><i style=${{ background: `var(${plan.color})` }} />${plan.name}${place === best && plans.length ? html` <span class="mark">best</span>` : ""}</h3>
         <${Picture} image=${plan.frames[step] ?? frame} label=${`predicted for ${plan.name}`} note=${plans.length ? "" : note} />
-        <p>${plans.length ? html`cost <b>${levels(costs[place]).toFixed(1)}</b>${plan.expected === undefined ? "" : ` ± ${levels(plan.expected).toFixed(1)}`}` : "…"}</p>
+        <p>${plans.length ? html`cost <b>${levels(costs[place]).toFixed(1)}</b>${plan.expected === undefined ? "" : ` ±\u00a0${levels(plan.expected).toFixed(1)}`}` : "…"}</p>
       </button>`)}</div>
     <footer><${Copy} curl=${() => curl("POST", path(robot), requestFor(robot, robot.context), " -H 'Accept: image/gif' -o plans.gif")}
       python=${() => requests("POST", path(robot), requestFor(robot, robot.context), "for rollout in answer.json()[\"rollouts\"]:\n    print(len(rollout), \"frames\")")} /></footer>

@@ -6,23 +6,22 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use axum::response::Response;
-use metrics::{counter, histogram};
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
-use self::bodies::{PlanRequest, PlanResponse, SessionPlanRequest};
+use self::bodies::PlanRequest;
 use super::picture;
 use super::sessions::AuthorizedSession;
 use crate::server::http::extract::{Path, ResponseFormat};
 use crate::server::http::multipart::BodyOrForm;
 use crate::server::http::problem::ApiError;
 use crate::server::http::structured::{JsonOrMsgpack, structured};
+use crate::server::plans::request::SessionPlanRequest;
+use crate::server::plans::response::{PlanForm, PlanResponse};
+use crate::server::plans::search::{ChosenPlan, PlanTask};
 use crate::server::state::App;
-use foreframe_core::metric_names;
-use foreframe_core::planning::{PlanBatch, PlanChoice, PlanContext, PlanError, Planner, PlannerInput};
-use foreframe_core::registry::Model;
-use foreframe_core::serving::{ConditioningInput, Prediction};
-use foreframe_core::types::RobotState;
+use foreframe_core::frame::Frame;
+use foreframe_core::planning::PlanContext;
 
 pub(in crate::server) fn routes() -> OpenApiRouter<App> {
     OpenApiRouter::new()
@@ -56,16 +55,19 @@ async fn model_plan(
     let model = app.predictor().active(&model)?;
     let _place = app.admission.enter()?;
     let (manifest, config) = (Arc::clone(&model.manifest), Arc::clone(&app.config));
-    let answer = request.answer_form(wanted);
+    let answer = PlanAnswerForm {
+        wanted,
+        body: request.form(),
+    };
     let decode = move || request.into_search(wanted, &manifest, &config);
     let (seen, context, input) = app.predictions.run(decode).await??;
-    let search = Search {
+    let search = PlanTask {
         model,
         context,
         session: None,
         begun,
     };
-    let choice = search.run(&app, input).await?;
+    let choice = search.run(app.predictor(), &app.predictions, input).await?;
     let encode = move || answer.of(choice, &seen, begun.elapsed());
     picture::threads_for(&app, wanted).run(encode).await?
 }
@@ -102,119 +104,37 @@ async fn session_plan(
         )));
     }
     let _place = app.admission.enter()?;
-    let answer = request.answer_form(wanted);
+    let answer = PlanAnswerForm {
+        wanted,
+        body: request.form(),
+    };
     let context = PlanContext::new(state.rollout_task(Vec::new(), model.spec()));
     let (manifest, config) = (Arc::clone(&model.manifest), Arc::clone(&app.config));
     let decode = move || request.into_input(&state, settings.resize, &manifest, &config);
     let input = app.predictions.run(decode).await??;
-    let search = Search {
+    let search = PlanTask {
         model,
         context,
         session: Some(session.key),
         begun,
     };
-    let choice = search.run(&app, input).await?;
+    let choice = search.run(app.predictor(), &app.predictions, input).await?;
     let encode = move || answer.of(choice, &[], begun.elapsed());
     picture::threads_for(&app, wanted).run(encode).await?
 }
 
-/// A search on this server: plans are judged on a blocking thread, and predicted by the inference thread beside other requests.
-struct Search {
-    model: Arc<Model>,
-    context: PlanContext,
-    session: Option<u64>,
-    begun: Instant,
+/// How an answer is given.
+struct PlanAnswerForm {
+    wanted: ResponseFormat,
+    body: PlanForm,
 }
 
-/// The answer of a search, with the model that made it.
-struct ChosenPlan {
-    model: Arc<Model>,
-    choice: PlanChoice,
-}
-
-impl Search {
-    async fn run(self, app: &App, input: PlannerInput) -> Result<ChosenPlan, ApiError> {
-        let (state, budget, begun) = (input.state.clone(), input.settings.budget, self.begun);
-        let model = Arc::clone(&self.model);
-        let mut planner = app.predictions.run(move || Planner::new(&model, input)).await??;
-        let steps = planner.steps();
-        let mut predicted: Option<(Prediction, Duration)> = None;
-        loop {
-            let next = move || -> Result<(Planner, Option<PlanBatch>), PlanError> {
-                if let Some((prediction, took)) = predicted {
-                    planner.record(prediction, took)?;
-                }
-                let batch = planner.next_batch(&|| begun.elapsed())?;
-                Ok((planner, batch))
-            };
-            let batch;
-            (planner, batch) = app.predictions.run(next).await??;
-            let Some(batch) = batch else { break };
-            let asked = Instant::now();
-            let Some(prediction) = self.predict(app, batch, (state.clone(), steps), budget).await? else {
-                break;
-            };
-            predicted = Some((prediction, asked.elapsed()));
-        }
-        let choice = app.predictions.run(move || planner.finish()).await?;
-        self.count(&choice);
-        Ok(ChosenPlan {
-            model: self.model,
-            choice,
-        })
-    }
-
-    /// The prediction of a batch; `None` if the budget was over before it came.
-    async fn predict(
-        &self,
-        app: &App,
-        batch: PlanBatch,
-        (state, steps): (Option<RobotState>, usize),
-        budget: Option<Duration>,
-    ) -> Result<Option<Prediction>, ApiError> {
-        let inputs = ConditioningInput::of_plans(batch.plans, state, Some(steps), &self.model.manifest)?;
-        let task = self.context.task(inputs, batch.sees_occupancy);
-        let computed = app.predictor().compute(&self.model, task, self.session);
-        let Some(budget) = budget else {
-            return Ok(Some(computed.await?));
-        };
-        match tokio::time::timeout_at((self.begun + budget).into(), computed).await {
-            Ok(prediction) => Ok(Some(prediction?)),
-            Err(_) => Ok(None),
-        }
-    }
-
-    fn count(&self, choice: &PlanChoice) {
-        let model = self.model.manifest.name.to_string();
-        let outcome = match choice.unsafe_reason {
-            None => "safe",
-            Some(_) => "stop",
-        };
-        counter!(metric_names::PLANS, "model" => model.clone(), "outcome" => outcome).increment(1);
-        histogram!(metric_names::PLAN_SECONDS, "model" => model).record(self.begun.elapsed());
-    }
-}
-
-impl From<PlanError> for ApiError {
-    fn from(error: PlanError) -> Self {
-        match error {
-            PlanError::Prediction(error) => error.into(),
-            _ => Self::of(&error),
-        }
-    }
-}
-
-impl bodies::PlanAnswerForm {
+impl PlanAnswerForm {
     /// The answer in the form that was asked for.
-    fn of(
-        self,
-        found: ChosenPlan,
-        seen: &[foreframe_core::frame::Frame],
-        took: Duration,
-    ) -> Result<Response, ApiError> {
+    fn of(self, found: ChosenPlan, seen: &[Frame], took: Duration) -> Result<Response, ApiError> {
         let ChosenPlan { model, choice } = found;
         let all = || std::iter::once(&choice.best).chain(&choice.runners_up);
-        let frames = || -> Vec<&[foreframe_core::frame::Frame]> {
+        let frames = || -> Vec<&[Frame]> {
             all()
                 .filter_map(|candidate| Some(candidate.rollout.as_ref()?.frames.as_slice()))
                 .collect()
@@ -227,7 +147,7 @@ impl bodies::PlanAnswerForm {
             }
             ResponseFormat::Json | ResponseFormat::Msgpack => {
                 let wanted = self.wanted;
-                let body = PlanResponse::new(self, &model.manifest, choice, took)?;
+                let body = PlanResponse::new(self.body, &model.manifest, choice, took)?;
                 Ok(structured(wanted, &body))
             }
         }

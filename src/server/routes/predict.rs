@@ -10,17 +10,17 @@ use utoipa_axum::routes;
 use super::picture;
 use crate::server::config::ServerConfig;
 use crate::server::http::extract::{Path, ResponseFormat};
-use crate::server::http::multipart::{BodyOrForm, WithFrames, check_count};
-use crate::server::http::problem::{ApiError, unfit};
+use crate::server::http::multipart::{BodyOrForm, WithFrames};
+use crate::server::http::problem::ApiError;
 use crate::server::http::structured::structured;
-use crate::server::images::{self, ImageBytes, ImageError, ImageFormat, ImageInput};
+use crate::server::images::{self, ImageBytes, ImageFormat, ImageInput};
+use crate::server::request_inputs;
 use crate::server::state::App;
 use foreframe_core::frame::Frame;
 use foreframe_core::frame::resize::Resize;
 use foreframe_core::frame::warp::CameraModel;
 use foreframe_core::registry::Manifest;
 use foreframe_core::serving::{InputError, Prediction, PredictionInput, ServingError, Task, Timing};
-use foreframe_core::types::{Action, RobotState};
 use foreframe_train::evaluation::figures::montage::prediction_sheet;
 
 pub(in crate::server) fn routes() -> OpenApiRouter<App> {
@@ -149,17 +149,21 @@ impl PredictRequest {
         config: &ServerConfig,
     ) -> Result<(Vec<Frame>, Task), ApiError> {
         let (format, resize) = (self.format, self.resize);
-        check_steps(self.steps, manifest, config)?;
+        request_inputs::check_steps(self.steps, manifest, config)?;
         self.units.as_ref().map_or(Ok(()), |units| units.check(manifest))?;
-        let frames = decode_frames(self.frames, ImageInput { format, resize }, manifest, config.max_frames)?;
+        let frames =
+            request_inputs::decode_frames(self.frames, ImageInput { format, resize }, manifest, config.max_frames)?;
         let seen = picture::context_for(wanted, &frames);
-        let (past_states, state) = states(self.state, self.states, frames.len())?;
+        let (past_states, state) = request_inputs::states(self.state, self.states, frames.len())?;
         let input = PredictionInput {
             state,
             past_states,
             camera: self.camera,
-            actions: actions("actions", self.actions)?,
-            plan: self.plan.map(|values| actions("plan", values)).transpose()?,
+            actions: request_inputs::actions("actions", self.actions)?,
+            plan: self
+                .plan
+                .map(|values| request_inputs::actions("plan", values))
+                .transpose()?,
             steps: self.steps,
             frames,
         };
@@ -198,65 +202,6 @@ impl Units {
         }
         Ok(())
     }
-}
-
-/// Errors: `Unprocessable` if a request asks for more than this server predicts. The model's own horizon is always allowed.
-pub(super) fn check_steps(steps: Option<usize>, manifest: &Manifest, config: &ServerConfig) -> Result<(), ApiError> {
-    let limit = config.max_steps.max(manifest.spec.horizon);
-    match steps {
-        Some(found) if !(1..=limit).contains(&found) => Err(ApiError::Unprocessable(format!(
-            "steps is {found}; this server predicts 1 to {limit}"
-        ))),
-        _ => Ok(()),
-    }
-}
-
-/// The images of `frames` in a request as frames of the model's size.
-pub(super) fn decode_frames(
-    frames: Vec<ImageBytes>,
-    input: ImageInput,
-    manifest: &Manifest,
-    limit: usize,
-) -> Result<Vec<Frame>, ApiError> {
-    check_count("frames", frames.len(), limit)?;
-    let frame = |(index, image)| images::decode(&format!("frames[{index}]"), image, input, manifest);
-    let frames: Result<_, ImageError> = frames.into_iter().enumerate().map(frame).collect();
-    Ok(frames?)
-}
-
-/// The states at the earlier frames, if they are given, and that at the last one, from `state` or `states` of a request.
-pub(super) fn states(
-    state: Option<Vec<f32>>,
-    states: Option<Vec<Vec<f32>>>,
-    frames: usize,
-) -> Result<(Vec<RobotState>, Option<RobotState>), ApiError> {
-    let (past, last) = match (state, states) {
-        (_, Some(states)) if states.len() != frames => {
-            return Err(ApiError::Unprocessable(format!(
-                "states holds {} states; there are {frames} frames, and each has one",
-                states.len()
-            )));
-        }
-        (Some(_), Some(_)) => {
-            return Err(ApiError::Unprocessable(
-                "state and states are both given; give one".to_owned(),
-            ));
-        }
-        (None, Some(mut states)) => {
-            let last = states.pop();
-            (states, last)
-        }
-        (state, None) => (Vec::new(), state),
-    };
-    let state = |values| RobotState::try_from(values).map_err(unfit("state"));
-    let past = past.into_iter().map(state).collect::<Result<_, _>>()?;
-    Ok((past, last.map(state).transpose()?))
-}
-
-/// The actions in `field` of a request.
-pub(super) fn actions(field: &str, values: Vec<Vec<f32>>) -> Result<Vec<Action>, ApiError> {
-    let action = |(index, values)| Action::try_from(values).map_err(unfit(&format!("{field}[{index}]")));
-    values.into_iter().enumerate().map(action).collect()
 }
 
 impl From<ServingError> for ApiError {

@@ -8,7 +8,6 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::picture;
-use super::predict;
 use super::sessions::AuthorizedSession;
 use crate::server::config::ServerConfig;
 use crate::server::http::extract::{Path, ResponseFormat};
@@ -16,6 +15,7 @@ use crate::server::http::multipart::{BodyOrForm, WithFrames, check_count};
 use crate::server::http::problem::ApiError;
 use crate::server::http::structured::{JsonOrMsgpack, structured};
 use crate::server::images::{self, ImageBytes, ImageFormat, ImageInput};
+use crate::server::request_inputs;
 use crate::server::state::App;
 use foreframe_core::frame::Frame;
 use foreframe_core::frame::resize::Resize;
@@ -165,7 +165,7 @@ async fn session_rollouts(
             "the session has {have} of the {need} frames that a prediction takes; send more frames"
         )));
     }
-    let (_, given) = predict::states(request.state, None, 0)?;
+    let (_, given) = request_inputs::states(request.state, None, 0)?;
     let robot_state = given.or_else(|| state.robot_state().cloned());
     let inputs = conditioning(request.plans, request.steps, robot_state, &model.manifest, app.config())?;
     let task = state.rollout_task(inputs, model.spec());
@@ -183,8 +183,9 @@ impl RolloutRequest {
         config: &ServerConfig,
     ) -> Result<(Vec<Frame>, Task), ApiError> {
         let (format, resize) = (self.format, self.resize);
-        let frames = predict::decode_frames(self.frames, ImageInput { format, resize }, manifest, config.max_frames)?;
-        let (past_states, state) = predict::states(self.state, self.states, frames.len())?;
+        let frames =
+            request_inputs::decode_frames(self.frames, ImageInput { format, resize }, manifest, config.max_frames)?;
+        let (past_states, state) = request_inputs::states(self.state, self.states, frames.len())?;
         let conditioning = conditioning(self.plans, self.steps, state, manifest, config)?;
         let seen = picture::context_for(wanted, &frames);
         let task = Task::rollout(frames, past_states, self.camera, conditioning, manifest)?;
@@ -207,7 +208,7 @@ pub(super) fn conditioning(
             "plans is empty; give at least one plan".to_owned(),
         ));
     }
-    predict::check_steps(steps, manifest, config)?;
+    request_inputs::check_steps(steps, manifest, config)?;
     let found = plans.len() as u64 * steps.unwrap_or(spec.horizon) as u64 * spec.pixels() as u64;
     let limit = config.max_rollout_bytes;
     if found > limit as u64 {
@@ -218,7 +219,7 @@ pub(super) fn conditioning(
     let plans = plans
         .into_iter()
         .enumerate()
-        .map(|(index, values)| predict::actions(&format!("plans[{index}]"), values))
+        .map(|(index, values)| request_inputs::actions(&format!("plans[{index}]"), values))
         .collect::<Result<_, _>>()?;
     Ok(ConditioningInput::of_plans(plans, state, steps, manifest)?)
 }

@@ -98,6 +98,7 @@ pub(super) fn services(app: &App, caller: Caller, messages: Messages) -> StreamS
         config: Arc::clone(&app.config),
         predictor: app.predictor().clone(),
         blocking: app.predictions.clone(),
+        admission: app.admission.clone(),
         streams: app.streams.clone(),
         keys: app.keys.clone(),
         caller,

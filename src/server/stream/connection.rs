@@ -1,6 +1,7 @@
-//! One WebSocket of a session. Three things run at the same time, each in order: it reads and checks messages, computes
-//! the answers to earlier ones, and sends the answers that are ready.
+//! One WebSocket of a session. Four things run at the same time, each in order: it reads and checks messages, computes
+//! the answers to earlier ones, searches for plans that are due, and sends what is ready.
 
+use std::convert::Infallible;
 use std::fmt::Display;
 use std::sync::Arc;
 use std::time::Duration;
@@ -14,6 +15,7 @@ use tokio::time::{Instant, timeout};
 use tracing::{debug, info, trace};
 
 use super::outbox::Outbox;
+use super::plans::{DuePlan, PlanSchedule};
 use super::protocol::{
     ClientMessage, ClosingReason, Codec, ConfigureMessage, ErrorCode, FrameMessage, ServerMessage, StreamLimits,
     WarningCode,
@@ -30,7 +32,7 @@ use foreframe_core::metric_names;
 /// A message that is answered in the order in which it came.
 enum PipelinedItem {
     Frame(Box<FrameStep>),
-    Configure(ConfigureMessage),
+    Configure(Box<ConfigureMessage>),
     Refused(ErrorCode, String),
 }
 
@@ -81,8 +83,13 @@ impl StreamConnection {
         self.outbox.push(self.ready()).await;
         let worked = async {
             let (inbox, items) = mpsc::channel(self.services.config.max_pipelined_frames);
-            let answered = self.answer(items).map(Ok);
-            let (reason, ()) = tokio::try_join!(self.read(&mut stream, inbox), answered)?;
+            // The answers never wait for a plan, so there is one at most.
+            let (plans, due) = mpsc::channel(1);
+            let answered = self.answer(items, plans).map(Ok);
+            let reason = tokio::select! {
+                ended = async { tokio::try_join!(self.read(&mut stream, inbox), answered) } => ended?.0,
+                never = self.plan(due) => match never {},
+            };
             self.outbox.close(reason);
             // The writer ends the stream.
             std::future::pending::<Result<(), ClientGone>>().await
@@ -167,7 +174,7 @@ impl StreamConnection {
                 }
                 Ok(ClientMessage::Configure(message)) => {
                     resize = message.resize.or(resize);
-                    PipelinedItem::Configure(message)
+                    PipelinedItem::Configure(Box::new(message))
                 }
                 Ok(ClientMessage::Ping(ping)) => {
                     let timestamp_us = ping.timestamp_us;
@@ -214,11 +221,11 @@ impl StreamConnection {
     }
 
     /// Answers the items in order, until there is no more.
-    async fn answer(&self, mut items: mpsc::Receiver<PipelinedItem>) {
+    async fn answer(&self, mut items: mpsc::Receiver<PipelinedItem>, plans: mpsc::Sender<DuePlan>) {
         // A client that never stops sending still gets a prediction at times.
         let limit = self.services.config.max_pipelined_frames;
         let (predictor, blocking) = (&self.services.predictor, &self.services.blocking);
-        let (mut following, mut overtaken_in_a_row) = (None, 0);
+        let (mut following, mut overtaken_in_a_row, mut schedule) = (None, 0, PlanSchedule::new());
         loop {
             let item = match following.take() {
                 Some(item) => Some(item),
@@ -237,7 +244,7 @@ impl StreamConnection {
                         Err(error) => self.error(error.code(), without_middle(&error)),
                     }
                 }
-                PipelinedItem::Configure(message) => self.ownership.session.configure(message),
+                PipelinedItem::Configure(message) => self.configure(&message, &mut schedule).await,
                 PipelinedItem::Refused(code, detail) => self.error(code, detail),
             };
             if let ServerMessage::Overtaken { .. } = answer {
@@ -246,8 +253,31 @@ impl StreamConnection {
             } else {
                 overtaken_in_a_row = 0;
             }
+            let due = schedule.due(&answer, &self.ownership.session, &self.services);
             self.outbox.push(answer).await;
+            if let Some(due) = due {
+                plans.try_send(due).ok().expect("a second plan that waits is a bug");
+            }
         }
+    }
+
+    async fn configure(&self, message: &ConfigureMessage, schedule: &mut PlanSchedule) -> ServerMessage {
+        let session = &self.ownership.session;
+        match schedule.configure(message, session, &self.services).await {
+            Ok(()) => session.configure(message),
+            Err(error) => self.error(ErrorCode::Invalid, without_middle(&error.into_detail())),
+        }
+    }
+
+    /// Searches for the plans that are due.
+    async fn plan(&self, mut due: mpsc::Receiver<DuePlan>) -> Infallible {
+        while let Some(plan) = due.recv().await {
+            let _places = plan.places();
+            let found = plan.search(&self.ownership.session, &self.services).await;
+            self.outbox.push(found).await;
+        }
+        // The answers have ended, and whoever waits for them ends the stream.
+        std::future::pending().await
     }
 
     fn error(&self, code: ErrorCode, detail: String) -> ServerMessage {

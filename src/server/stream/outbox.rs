@@ -139,6 +139,7 @@ fn bytes(message: &ServerMessage) -> usize {
     MESSAGE_BYTES
         + match message {
             ServerMessage::Prediction { frames, .. } => frames.iter().map(|frame| frame.0.len()).sum(),
+            ServerMessage::Plan { answer, .. } => answer.bytes(),
             ServerMessage::Error { detail, .. } => detail.len(),
             _ => 0,
         }

@@ -9,6 +9,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::server::config::ServerConfig;
 use crate::server::images::{ImageBytes, ImageFormat};
+use crate::server::plans::request::SessionPlanRequest;
+use crate::server::plans::response::PlanResponse;
 use foreframe_core::frame::resize::Resize;
 use foreframe_core::nn::ModelSpec;
 
@@ -58,7 +60,7 @@ pub struct FrameMessage {
 }
 
 /// Changes of a session's settings; absent settings stay as they are.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, Serialize)]
+#[derive(Clone, Debug, Default, PartialEq, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct ConfigureMessage {
     /// What happens if frames are missing.
@@ -73,6 +75,12 @@ pub struct ConfigureMessage {
     /// How a frame of another size is resized.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub resize: Option<Resize>,
+    /// Every N-th prediction of this stream, from the next one on, is followed by a plan; 0: none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub plan_every: Option<u64>,
+    /// What the plans are to reach and how they are searched for: the body of `POST /v1/sessions/{id}/plan`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub plan_request: Option<Box<SessionPlanRequest>>,
 }
 
 /// Settings of a session.
@@ -193,6 +201,17 @@ pub enum ServerMessage {
         /// Missing frames before this one.
         skipped: u64,
     },
+    /// The plan that was asked for with `plan_every`, searched for from this frame on.
+    Plan {
+        /// The `seq` of the frame.
+        seq: u64,
+        /// The time of the frame, echoed.
+        timestamp_us: i64,
+        /// The answer of `POST /v1/sessions/{id}/plan`.
+        answer: Box<PlanResponse>,
+        /// Plans that were due since the last one, but skipped, because the search before had not ended or the server was busy.
+        skipped: u64,
+    },
     /// The frame is in the context but got no prediction, because newer frames were waiting.
     Overtaken {
         /// The `seq` of the frame.
@@ -269,6 +288,8 @@ pub enum WarningCode {
     Slow,
     /// No message came for long; the stream will be closed.
     Idle,
+    /// A plan that was due could not be made.
+    Plan,
 }
 
 /// The kinds of errors of a stream.

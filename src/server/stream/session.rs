@@ -110,7 +110,7 @@ impl Session {
         inner.used = inner.used.max(now);
     }
 
-    pub(in crate::server) fn configure(&self, message: ConfigureMessage) -> ServerMessage {
+    pub(in crate::server) fn configure(&self, message: &ConfigureMessage) -> ServerMessage {
         let mut inner = self.inner();
         let settings = &mut inner.core.settings;
         settings.on_gap = message.on_gap.unwrap_or(settings.on_gap);

@@ -12,6 +12,7 @@ use tungstenite::error::ProtocolError;
 use super::protocol::{ClosingReason, ErrorCode};
 use crate::server::blocking::BlockingWork;
 use crate::server::config::ServerConfig;
+use crate::server::http::admission::Admission;
 use crate::server::http::body_budget;
 use crate::server::http::keys::{Caller, Keys};
 use crate::server::http::message_bytes::MessageBytes;
@@ -38,6 +39,8 @@ pub(in crate::server) struct StreamServices {
     pub(in crate::server) config: Arc<ServerConfig>,
     pub(in crate::server) predictor: Predictor,
     pub(in crate::server) blocking: BlockingWork,
+    /// The places of plans among other requests.
+    pub(in crate::server) admission: Admission,
     pub(in crate::server) streams: TaskLimit,
     pub(in crate::server) keys: Keys,
     /// Who opened the stream.

@@ -45,6 +45,7 @@ pub use self::saved_shards::saved_part_shards;
 pub use self::skipped::SkippedItem;
 use self::skipped::listed;
 use self::timing::ImportPlan;
+use self::writer::EpisodeSources;
 pub use self::writer::{ImportProgress, Imported, saved_shards};
 use foreframe_core::types::Channel;
 
@@ -82,8 +83,12 @@ pub fn import_parts(
         // Its images are read while the data set is written.
         let source = UnpackedSource::of(config, cancelled)?;
         let written = plan(&source.path, config, cancelled).and_then(|plan| {
-            let saved = SavedShards::new(config, &plan, parts);
-            directory.write(&plan, &saved, on_progress, cancelled)
+            let from = EpisodeSources {
+                plan: &plan,
+                saved: &SavedShards::new(config, &plan, parts),
+                source: &source,
+            };
+            directory.write(&from, on_progress, cancelled)
         });
         written.map_err(|error| source.name_in_archive(error))
     };

@@ -26,6 +26,7 @@ pub(super) async fn run(args: &SaturateArgs, bounds: &mut Bounds) {
     let mut peak_hz: f64 = 0.0;
     for sessions in [args.sessions / 8, args.sessions / 4, args.sessions / 2] {
         let load = RobotLoad {
+            plan_samples: None,
             sessions: sessions.max(1),
             mode: SendMode::ClosedLoop(AHEAD),
             on_late: OnLate::Predict,
@@ -43,6 +44,7 @@ pub(super) async fn run(args: &SaturateArgs, bounds: &mut Bounds) {
     }
     let offered_hz = args.times * peak_hz;
     let load = RobotLoad {
+        plan_samples: None,
         sessions: args.sessions,
         mode: SendMode::ScheduledOrDropped(offered_hz / args.sessions as f64),
         on_late: if args.skip_late { OnLate::Skip } else { OnLate::Predict },

@@ -13,7 +13,8 @@ use crate::server::config::ServerConfig;
 use crate::server::http::multipart::check_count;
 use crate::server::http::problem::ApiError;
 use crate::server::inference_statistics::InferenceTimes;
-use crate::server::routes::{predict, rollouts};
+use crate::server::request_inputs;
+use crate::server::routes::rollouts;
 use crate::server::state::App;
 use foreframe_core::frame::Frame;
 use foreframe_core::registry::{Manifest, Model};
@@ -104,7 +105,7 @@ impl InferenceTask {
             ));
         }
         let has_plans = plans.is_some();
-        let (past_states, state) = predict::states(state, None, frames.len())?;
+        let (past_states, state) = request_inputs::states(state, None, frames.len())?;
         let task = if let Some(plans) = plans {
             Task::rollout(
                 frames,
@@ -114,12 +115,12 @@ impl InferenceTask {
                 manifest,
             )?
         } else {
-            predict::check_steps(steps, manifest, config)?;
+            request_inputs::check_steps(steps, manifest, config)?;
             let input = PredictionInput {
                 frames,
-                actions: predict::actions("actions", actions)?,
+                actions: request_inputs::actions("actions", actions)?,
                 state,
-                plan: plan.map(|plan| predict::actions("plan", plan)).transpose()?,
+                plan: plan.map(|plan| request_inputs::actions("plan", plan)).transpose()?,
                 steps,
                 ..PredictionInput::default()
             };

@@ -6,6 +6,7 @@ use serde::{Deserialize, Deserializer};
 
 use super::{ClientMessage, CloseMessage, ConfigureMessage, FrameMessage, OnGap, OnLate, PingMessage};
 use crate::server::images::{ImageBytes, ImageFormat};
+use crate::server::plans::request::SessionPlanRequest;
 use foreframe_core::frame::resize::Resize;
 
 /// The maximum number of items of a list in a message: more than any model takes.
@@ -27,6 +28,8 @@ pub(super) struct AnyMessage {
     on_gap: Option<OnGap>,
     on_late: Option<OnLate>,
     resize: Option<Resize>,
+    plan_every: Option<u64>,
+    plan_request: Option<Box<SessionPlanRequest>>,
 }
 
 #[derive(Clone, Copy, Deserialize)]
@@ -90,6 +93,8 @@ impl TryFrom<AnyMessage> for ClientMessage {
                 on_late: any.on_late.take(),
                 format: any.format.take(),
                 resize: any.resize.take(),
+                plan_every: any.plan_every.take(),
+                plan_request: any.plan_request.take(),
             }),
             MessageKind::Ping => Self::Ping(PingMessage {
                 timestamp_us: any.timestamp_us.take().unwrap_or_default(),
@@ -117,6 +122,8 @@ impl AnyMessage {
             ("on_gap", self.on_gap.is_some()),
             ("on_late", self.on_late.is_some()),
             ("resize", self.resize.is_some()),
+            ("plan_every", self.plan_every.is_some()),
+            ("plan_request", self.plan_request.is_some()),
         ];
         fields
             .into_iter()

@@ -11,7 +11,9 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use flate2::read::MultiGzDecoder;
 
 use self::unpacker::Unpacker;
+use super::error::moved_text;
 use super::files::{entries, open_file};
+use super::skipped::SkippedItem;
 use super::{ImportConfig, ImportError};
 use foreframe_core::files::remove_dir;
 
@@ -99,6 +101,18 @@ impl UnpackedSource {
         match &self.archive {
             Some(ArchiveFolder { archive, folder }) => error.moved(folder, archive),
             None => error,
+        }
+    }
+
+    /// The same item, with paths in the archive instead of those of the unpacked files.
+    pub(super) fn item_in_archive(&self, item: SkippedItem) -> SkippedItem {
+        let Some(ArchiveFolder { archive, folder }) = &self.archive else {
+            return item;
+        };
+        let [place, reason] = [&item.place, &item.reason].map(|text| moved_text(text, folder, archive));
+        SkippedItem {
+            count: item.count,
+            ..SkippedItem::new(&place, &reason)
         }
     }
 }

@@ -12,6 +12,7 @@ mod compression;
 mod database;
 mod index;
 mod join;
+mod json;
 pub mod live;
 mod mcap;
 mod messages;

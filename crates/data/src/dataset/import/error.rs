@@ -164,8 +164,7 @@ impl ImportError {
             Ok(rest) => to.join(rest),
             Err(_) => path,
         };
-        let [from_text, to_text] = [from, to].map(|path| path.display().to_string());
-        let text = |text: String| text.replace(&from_text, &to_text);
+        let text = |text: String| moved_text(&text, from, to);
         match self {
             Self::UnknownSource(path) => Self::UnknownSource(moved(path)),
             Self::Option(reason) => Self::Option(text(reason)),
@@ -200,4 +199,9 @@ impl ImportError {
         });
         Ok(())
     }
+}
+
+/// A text that names paths below one folder, with those below another instead.
+pub(super) fn moved_text(text: &str, from: &Path, to: &Path) -> String {
+    text.replace(&*from.to_string_lossy(), &to.to_string_lossy())
 }

@@ -2,6 +2,7 @@
 
 use std::path::Path;
 
+use super::error::moved_text;
 use serde::{Deserialize, Serialize};
 
 /// How many items are listed; more are only counted, so that a recording with endless damage needs little memory.
@@ -89,13 +90,12 @@ impl SkippedList {
 
     /// The same with another path instead of one that the items name.
     pub(super) fn moved(mut self, from: &Path, to: &Path) -> Self {
-        let [from, to] = [from, to].map(|path| path.display().to_string());
         for text in self
             .items
             .iter_mut()
             .flat_map(|item| [&mut item.place, &mut item.reason])
         {
-            *text = text.replace(&from, &to);
+            *text = moved_text(text, from, to);
         }
         self
     }

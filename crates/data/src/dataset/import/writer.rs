@@ -8,6 +8,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use serde::Serialize;
 
+use super::archive::UnpackedSource;
 use super::encoder::{EncodedShard, EpisodeEncoder};
 use super::saved_shards::SavedShards;
 use super::skipped::{MAX_ITEMS, SkippedItem};
@@ -19,6 +20,15 @@ use crate::dataset::store::files::{is_unused, write_atomically};
 use crate::dataset::store::layout::{DatasetMetadata, IMPORT_ARGUMENTS, INFO, shard_path};
 use crate::dataset::store::writer::{ShardWriter, shard_ranges};
 use foreframe_core::files::{none_if_missing, remove_partials};
+
+/// Where the episodes of an import come from.
+pub(super) struct EpisodeSources<'a> {
+    pub(super) plan: &'a ImportPlan,
+    /// What parts have made already.
+    pub(super) saved: &'a SavedShards<'a>,
+    /// The source that the plan's images are in.
+    pub(super) source: &'a UnpackedSource,
+}
 
 /// What was left out, with the shard in which it would have been; without one, if the source's lists show it.
 const SKIPPED: &str = "meta/skipped.json";
@@ -167,14 +177,15 @@ impl<'a> Directory<'a> {
         }
     }
 
-    /// Writes the shards that are missing, then the tables. Shards that parts saved are not read from the source again. Errors: `Cancelled`, `Image`, `Record`, `Io`, `Dataset`.
+    /// Writes the shards that are missing, then the tables. Shards that parts saved are not read from the source again.
+    /// Errors: `Cancelled`, `Image`, `Record`, `Io`, `Dataset`.
     pub(super) fn write(
         &self,
-        plan: &ImportPlan,
-        saved: &SavedShards,
+        from: &EpisodeSources<'_>,
         on_progress: &(dyn Fn(ImportProgress) + Sync),
         cancelled: &AtomicBool,
     ) -> Result<Imported, ImportError> {
+        let EpisodeSources { plan, saved, source } = *from;
         let mut writer = ShardWriter::new(&self.config.out, description(self.config, plan));
         let total = plan.episodes.iter().map(Vec::len).sum::<usize>() as u64;
         let mut done = 0;
@@ -208,7 +219,11 @@ impl<'a> Directory<'a> {
                     other => other,
                 })?;
                 let room = MAX_ITEMS.saturating_sub(skipped.len());
-                skipped.extend(bad.items(room).into_iter().map(|item| (Some(shard), item)));
+                skipped.extend(
+                    bad.items(room)
+                        .into_iter()
+                        .map(|item| (Some(shard), source.item_in_archive(item))),
+                );
                 self.write_skipped(&skipped)?;
                 writer.write(&encoded)?;
             }
@@ -219,7 +234,10 @@ impl<'a> Directory<'a> {
             return Err(ImportError::Empty(self.config.source.clone()));
         }
         let listed = plan.recording.skipped.items(MAX_ITEMS).into_iter();
-        let mut all: Vec<(Option<usize>, SkippedItem)> = listed.map(|item| (None, item)).chain(skipped).collect();
+        let mut all: Vec<(Option<usize>, SkippedItem)> = listed
+            .map(|item| (None, source.item_in_archive(item)))
+            .chain(skipped)
+            .collect();
         all.sort_by_key(|(of, _)| *of);
         self.write_skipped(&all)?;
         remove_partials(&self.config.out);

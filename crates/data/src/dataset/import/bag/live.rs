@@ -1,9 +1,11 @@
-//! Messages of a running robot, one by one: the types that bags have, in CDR, and the images of Foxglove in Protocol Buffers or JSON.
+//! Messages of a running robot, one by one: the types that bags have, in CDR, and images of Foxglove in Protocol Buffers or JSON.
+//! Commands and measurements can also come as JSON.
 
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use serde::Deserialize;
 
+use super::json;
 use super::messages::{self, RosType};
 use super::pixels::RawImage;
 use crate::protobuf::{bytes_of, number_of};
@@ -30,6 +32,11 @@ enum MessageDecoder {
     FoxgloveRawImage,
     FoxgloveCompressedImage,
     JsonImage,
+    /// An action or a state of ROS 2 in JSON.
+    JsonRos(RosType),
+    JsonPose,
+    /// Any other object in JSON, for its numbers.
+    JsonNumbers,
 }
 
 /// A number of a message by its name, as `linear.x`.
@@ -57,45 +64,64 @@ impl LiveType {
             ("protobuf", "foxglove.RawImage") => MessageDecoder::FoxgloveRawImage,
             ("protobuf", "foxglove.CompressedImage") => MessageDecoder::FoxgloveCompressedImage,
             ("json", "foxglove.RawImage" | "foxglove.CompressedImage") => MessageDecoder::JsonImage,
-            ("cdr", ros) => MessageDecoder::Ros(RosType::of(ros)),
-            _ => return None,
+            ("json", "foxglove.PoseInFrame") => MessageDecoder::JsonPose,
+            (encoding, name) => match (encoding, RosType::of(name)) {
+                ("json", RosType::Other) => MessageDecoder::JsonNumbers,
+                ("json", kind) if kind.is_command() || kind.is_measurement() => MessageDecoder::JsonRos(kind),
+                ("cdr", kind) if kind.is_image() || kind.is_command() || kind.is_measurement() => {
+                    MessageDecoder::Ros(kind)
+                }
+                _ => return None,
+            },
         };
-        let found = Self(decoder);
-        found.role().map(|_| found)
+        Some(Self(decoder))
     }
 
-    /// What it is used for by default; `None` if it is not used.
+    /// What it is used for by default; `None` if it is used only for what its topic is named for: an action or a state.
     #[must_use]
     pub fn role(self) -> Option<LiveRole> {
         match self.0 {
             MessageDecoder::Ros(kind) if kind.is_image() => Some(LiveRole::Image),
-            MessageDecoder::Ros(kind) if kind.is_command() => Some(LiveRole::Command),
-            MessageDecoder::Ros(kind) if kind.is_measurement() => Some(LiveRole::Measurement),
-            MessageDecoder::Ros(_) => None,
+            MessageDecoder::Ros(kind) | MessageDecoder::JsonRos(kind) => Some(if kind.is_command() {
+                LiveRole::Command
+            } else {
+                LiveRole::Measurement
+            }),
+            MessageDecoder::JsonPose | MessageDecoder::JsonNumbers => None,
             MessageDecoder::FoxgloveRawImage | MessageDecoder::FoxgloveCompressedImage | MessageDecoder::JsonImage => {
                 Some(LiveRole::Image)
             }
         }
     }
 
-    /// The image of a message, in gray. Errors: why it cannot be read.
+    /// Whether its messages hold images; those of the others hold numbers.
+    #[must_use]
+    pub fn is_image(self) -> bool {
+        self.role() == Some(LiveRole::Image)
+    }
+
+    /// The image of a message, in gray. Errors: why it cannot be read, or that it holds numbers.
     pub fn image(self, message: &[u8]) -> Result<Frame, String> {
         let file = match self.0 {
             MessageDecoder::Ros(RosType::Image) => return messages::image(message)?.1.gray(),
             MessageDecoder::JsonImage => return json_image(message),
             MessageDecoder::FoxgloveRawImage => return raw_image(message)?.gray(),
-            MessageDecoder::Ros(_) => messages::compressed_image(message)?.2,
+            MessageDecoder::Ros(RosType::CompressedImage) => messages::compressed_image(message)?.2,
             MessageDecoder::FoxgloveCompressedImage => bytes_of(message, COMPRESSED_DATA).unwrap_or_default(),
+            _ => return Err("it has numbers and no image".to_owned()),
         };
         codec::decode(file).map_err(|error| error.to_string())
     }
 
     /// The numbers of a message. Errors: why it cannot be read, or that it is an image.
     pub fn values(self, message: &[u8]) -> Result<Vec<LiveValue>, String> {
-        let MessageDecoder::Ros(kind) = self.0 else {
-            return Err("it is an image, which has no numbers".to_owned());
+        let values = match self.0 {
+            MessageDecoder::Ros(kind) if !kind.is_image() => messages::values(kind, message)?.1,
+            MessageDecoder::JsonRos(kind) => json::values(kind, message)?,
+            MessageDecoder::JsonPose => json::pose(message)?,
+            MessageDecoder::JsonNumbers => json::numbers(message)?,
+            _ => return Err("it is an image, which has no numbers".to_owned()),
         };
-        let (_, values) = messages::values(kind, message)?;
         let named = values.into_iter().map(|field| LiveValue {
             name: field.name.into_owned(),
             value: field.value,
@@ -197,7 +223,18 @@ mod tests {
         assert_eq!(role("cdr", "sensor_msgs/msg/CompressedImage"), Some(LiveRole::Image));
         assert_eq!(role("cdr", "nav_msgs/msg/Odometry"), Some(LiveRole::Measurement));
         assert_eq!(role("cdr", "geometry_msgs/msg/Twist"), Some(LiveRole::Command));
-        assert_eq!(role("json", "sensor_msgs/msg/Image"), None);
-        assert_eq!(role("cdr", "sensor_msgs/msg/Imu"), None);
+        assert_eq!(role("json", "nav_msgs/Odometry"), Some(LiveRole::Measurement));
+        assert_eq!(role("json", "geometry_msgs/msg/TwistStamped"), Some(LiveRole::Command));
+        for named in ["foxglove.PoseInFrame", "robot.Command"] {
+            let kind = LiveType::of("json", named).unwrap();
+            assert!(kind.role().is_none() && !kind.is_image(), "{named}");
+        }
+        for unknown in [
+            ("json", "sensor_msgs/msg/Image"),
+            ("cdr", "sensor_msgs/msg/Imu"),
+            ("ros1", "x"),
+        ] {
+            assert_eq!(LiveType::of(unknown.0, unknown.1), None, "{unknown:?}");
+        }
     }
 }

@@ -118,7 +118,7 @@ pub(super) fn values(kind: RosType, message: &[u8]) -> Result<(Option<i64>, Vec<
     Ok((stamp, values))
 }
 
-fn field(name: impl Into<Cow<'static, str>>, unit: &'static str, value: f64) -> FieldValue {
+pub(super) fn field(name: impl Into<Cow<'static, str>>, unit: &'static str, value: f64) -> FieldValue {
     FieldValue {
         name: name.into(),
         unit,
@@ -127,28 +127,47 @@ fn field(name: impl Into<Cow<'static, str>>, unit: &'static str, value: f64) -> 
 }
 
 fn twist(reader: &mut CdrReader<'_>) -> Result<Vec<FieldValue>, String> {
-    const NAMES: [(&str, &str); 6] = [
-        ("linear.x", "m/s"),
-        ("linear.y", "m/s"),
-        ("linear.z", "m/s"),
-        ("angular.x", "rad/s"),
-        ("angular.y", "rad/s"),
-        ("angular.z", "rad/s"),
-    ];
-    let read = |(name, unit): (&'static str, &'static str)| Ok(field(name, unit, reader.f64(name)?));
-    NAMES.into_iter().map(read).collect()
+    let mut parts = [0.0; 6];
+    for (part, (name, _)) in parts.iter_mut().zip(SPEEDS) {
+        *part = reader.f64(name)?;
+    }
+    Ok(speed_fields(parts))
+}
+
+const SPEEDS: [(&str, &str); 6] = [
+    ("linear.x", "m/s"),
+    ("linear.y", "m/s"),
+    ("linear.z", "m/s"),
+    ("angular.x", "rad/s"),
+    ("angular.y", "rad/s"),
+    ("angular.z", "rad/s"),
+];
+
+/// The fields of a twist: linear x, y, z, then angular x, y, z.
+pub(super) fn speed_fields(parts: [f64; 6]) -> Vec<FieldValue> {
+    let named = SPEEDS.into_iter().zip(parts);
+    named.map(|((name, unit), value)| field(name, unit, value)).collect()
 }
 
 fn odometry(reader: &mut CdrReader<'_>) -> Result<Vec<FieldValue>, String> {
     reader.text("child_frame_id")?;
-    let mut fields = Vec::new();
-    for name in ["x", "y", "z"] {
-        fields.push(field(name, "m", reader.f64("pose.position")?));
+    let (mut position, mut quaternion) = ([0.0; 3], [0.0; 4]);
+    for part in &mut position {
+        *part = reader.f64("pose.position")?;
     }
-    let mut quaternion = [0.0; 4];
     for part in &mut quaternion {
         *part = reader.f64("pose.orientation")?;
     }
+    reader.f64_array(36, "pose.covariance")?;
+    let mut fields = pose_fields(position, quaternion);
+    fields.extend(twist(reader)?);
+    Ok(fields)
+}
+
+/// The fields of a pose. The quaternion is x, y, z, w.
+pub(super) fn pose_fields(position: [f64; 3], quaternion: [f64; 4]) -> Vec<FieldValue> {
+    let named = ["x", "y", "z"].into_iter().zip(position);
+    let mut fields: Vec<FieldValue> = named.map(|(name, value)| field(name, "m", value)).collect();
     let [x, y, z, w] = quaternion;
     let roll = (2.0 * (w * x + y * z)).atan2(1.0 - 2.0 * (x * x + y * y));
     let pitch = (2.0 * (w * y - z * x)).clamp(-1.0, 1.0).asin();
@@ -161,22 +180,25 @@ fn odometry(reader: &mut CdrReader<'_>) -> Result<Vec<FieldValue>, String> {
         field("pitch", "rad", pitch),
         field("yaw", "rad", yaw),
     ]);
-    reader.f64_array(36, "pose.covariance")?;
-    fields.extend(twist(reader)?);
-    Ok(fields)
+    fields
 }
 
 fn joint_state(reader: &mut CdrReader<'_>) -> Result<Vec<FieldValue>, String> {
     let names = reader.texts("name")?;
     let (positions, velocities) = (reader.f64_sequence("position")?, reader.f64_sequence("velocity")?);
+    Ok(joint_fields(&names, positions, velocities))
+}
+
+/// The fields of a `JointState`; positions or velocities may be absent.
+pub(super) fn joint_fields(names: &[impl AsRef<str>], positions: Vec<f64>, velocities: Vec<f64>) -> Vec<FieldValue> {
     let of = |values: Vec<f64>, what: &'static str, unit: &'static str| {
         let named = names.iter().zip(values).filter(|(_, value)| value.is_finite());
-        let named = named.map(move |(name, value)| field(format!("{name}.{what}"), unit, value));
+        let named = named.map(move |(name, value)| field(format!("{}.{what}", name.as_ref()), unit, value));
         named.collect::<Vec<_>>()
     };
     let mut fields = of(positions, "position", "rad");
     fields.extend(of(velocities, "velocity", "rad/s"));
-    Ok(fields)
+    fields
 }
 
 /// How a camera projects, as far as a [`foreframe_core::frame::warp::CameraModel`] can hold it.
