@@ -2,7 +2,9 @@
 
 use std::path::Path;
 
-use foreframe::server::protocol::{ClientMessage, Codec, ConfigureMessage, ErrorCode, FrameMessage, ServerMessage};
+use foreframe::server::protocol::{
+    ClientMessage, Codec, ConfigureMessage, ErrorCode, FrameMessage, PingMessage, ServerMessage,
+};
 use foreframe::server::{App, ServerConfig, SessionPlanRequest};
 use foreframe_core::nn::Conditioning;
 use serde_json::{Value, json};
@@ -151,7 +153,7 @@ async fn bad_plans_are_refused_with_the_field() {
     for seq in 0..CONTEXT as u64 + 2 {
         client.ask(&step(seq)).await;
     }
-    let pong = client.ask(&ClientMessage::Ping(Default::default())).await;
+    let pong = client.ask(&ClientMessage::Ping(PingMessage::default())).await;
     assert!(matches!(pong, ServerMessage::Pong { .. }), "{pong:?}");
     client
         .send_text(r#"{"type":"configure","plan_every":1,"plan_request":{"goal":{"place":[1,1]}}}"#)

@@ -256,7 +256,7 @@ impl StreamConnection {
             let due = schedule.due(&answer, &self.ownership.session, &self.services);
             self.outbox.push(answer).await;
             if let Some(due) = due {
-                plans.try_send(due).ok().expect("a second plan that waits is a bug");
+                plans.try_send(due).expect("a second plan that waits is a bug");
             }
         }
     }
