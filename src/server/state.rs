@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::convert::Infallible;
 use std::error::Error;
 use std::ops::Deref;
-use std::sync::atomic::AtomicBool;
+use std::sync::atomic::{AtomicBool, AtomicU64};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
@@ -81,6 +81,8 @@ pub struct AppState {
     pub(super) uploads: Uploads,
     /// Whether the server is stopping: it still answers, but reports that it is not ready.
     pub(super) draining: Arc<AtomicBool>,
+    /// How many data sets were deleted here, which no job tells.
+    pub(super) deleted_datasets: AtomicU64,
     pub(super) sessions: SessionTable,
     pub(super) inference_statistics: InferenceStatistics,
 }
@@ -141,6 +143,7 @@ impl App {
                 uploads: Uploads::new(&config),
                 world_sessions: Environments::new("session", &config),
                 draining: Arc::default(),
+                deleted_datasets: AtomicU64::default(),
                 sessions: SessionTable::new(config.max_sessions, Duration::from_millis(config.session_grace_ms)),
                 inference_statistics: InferenceStatistics::default(),
                 config: Arc::new(config),

@@ -161,7 +161,8 @@ impl Page {
 }
 
 /// True if a prediction has come true, so that all pictures are there.
-const IS_COMPLETE: &str = "/Error .* % of that of|Nothing moves/.test(document.querySelector('.verdict')?.textContent)
+const IS_COMPLETE: &str =
+    "/Error .* % of the best simple guess|Nothing moves/.test(document.querySelector('.verdict')?.textContent)
     && document.querySelectorAll('.play .picture.dim').length === 0";
 
 async fn serve(data_dir: &Path) -> (App, Keys, InProcessServer) {

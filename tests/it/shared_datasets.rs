@@ -1,6 +1,7 @@
 //! Data sets of several machines that share an object store; each has its own data directory and database.
 
 use std::path::Path;
+use std::time::Duration;
 
 use axum::body::Body;
 use axum::http::Request;
@@ -8,7 +9,7 @@ use foreframe::server::{App, ServerConfig};
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
-use crate::service::{Answer, get, poll_until, post, send};
+use crate::service::{Answer, get, poll_until, post, run, send};
 
 const JOBS: &str = "/v1/jobs";
 const SET: &str = "/v1/datasets/d";
@@ -65,6 +66,23 @@ async fn describing_a_shared_data_set_does_not_download_it() {
     let picture = get(&other, &format!("{SET}/episodes/2/preview.png")).await;
     assert!(picture.body.starts_with(b"\x89PNG"));
     assert!(there.path().join("datasets/d/meta/info.json").is_file());
+}
+
+#[tokio::test]
+async fn a_deleted_data_set_is_announced() {
+    let objects = tempfile::tempdir().unwrap();
+    let (_here, app) = machine(objects.path()).await;
+    collected(&app, 3).await;
+    let watched = app.clone();
+    let watcher = tokio::spawn(async move { get(&watched, "/v1/events").await });
+    // The lists as they are have been announced by then.
+    tokio::time::sleep(Duration::from_secs(1)).await;
+    assert_eq!(delete(&app).await.status, 204);
+    tokio::time::sleep(Duration::from_secs(1)).await;
+    run(app).await.stop().await;
+    let text = String::from_utf8(watcher.await.unwrap().body).unwrap();
+    let names: Vec<&str> = text.lines().filter_map(|line| line.strip_prefix("event: ")).collect();
+    assert_eq!(names, ["models", "jobs", "jobs", "stopping"], "{text}");
 }
 
 #[tokio::test]

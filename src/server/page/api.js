@@ -99,8 +99,8 @@ export async function all(path, name, limit = 1000) {
 const FIRST_WAIT_MS = 250;
 const LONGEST_WAIT_MS = 4000;
 
-// Listens to server-sent events, and connects again when the connection is lost. `on(name, data)` gets every event, and
-// "open" and "lost"; it returns true after the last event that it wants. EventSource cannot send the key.
+// Listens to server-sent events, and connects again when the connection is lost. `on(name, data)` gets every event,
+// "open", "lost", and "refused" with the reason if there is nothing to listen to; it returns true after the last event that it wants. EventSource cannot send the key.
 export function listen(path, on) {
   const stop = new AbortController();
   follow(path, on, stop.signal).catch(() => {});
@@ -121,7 +121,11 @@ async function follow(path, on, signal) {
       }
     } catch (error) {
       // Neither is worth another try: a key is missing, or there is nothing there. A rate limit is.
-      if (error instanceof Locked || (error instanceof ApiError && error.status < 500 && error.status !== 429)) return;
+      if (error instanceof Locked) return;
+      if (error instanceof ApiError && error.status < 500 && error.status !== 429) {
+        on("refused", error.message);
+        return;
+      }
     }
     if (signal.aborted) return;
     on("lost");

@@ -135,7 +135,7 @@ export function Dream({ robot }) {
 
 function whatItGets(model, dream) {
   if (!takesActions(model)) return dream ? "The model gets no camera frame." : "Cut the camera: the model goes on from its own frames.";
-  return dream ? "The model gets no camera frame, only your keys." : "Cut the camera: the model goes on from its own frames, under your keys.";
+  return dream ? "The model gets no camera frame, only the robot's actions." : "Cut the camera: the model goes on from its own frames, under your keys.";
 }
 
 // What a dream is, and how one would begin.

@@ -7,6 +7,7 @@ import { Picture } from "./picture.js";
 import { COLORS, Plot } from "./plot.js";
 import { bestGuess, compare, GUESSES, guessError, levels, lookBack } from "./score.js";
 import { Copy, curl, requests } from "./snippets.js";
+import { useRetry } from "./server_lists.js";
 import { fits, readEpisode } from "./sources.js";
 import { Stream } from "./stream.js";
 
@@ -25,11 +26,12 @@ async function readAll(dataset, episode) {
 
 function useEpisode(dataset, episode) {
   const [read, setRead] = useState({ data: null, wrong: "" });
+  const retry = useRetry(Boolean(read.wrong));
   useEffect(() => {
     let is_gone = false;
     readAll(dataset, episode).then(data => is_gone || setRead({ data, wrong: "" }), error => is_gone || setRead({ data: null, wrong: error.message }));
     return () => { is_gone = true; };
-  }, [dataset, episode]);
+  }, [dataset, episode, retry]);
   return read;
 }
 
@@ -38,14 +40,17 @@ const TOLD_EVERY = 20;
 // What a model predicts for every frame of an episode, and how wrong that is; filled while its stream answers.
 function usePredictions(model, data) {
   const [moments, setMoments] = useState([]);
+  const [wrong, setWrong] = useState("");
+  const retry = useRetry(Boolean(wrong));
   useEffect(() => {
     setMoments([]);
+    setWrong("");
     if (!model || !data) return undefined;
     let is_gone = false;
-    predictAll(model, data, done => is_gone || setMoments(done), () => is_gone).catch(() => {});
+    predictAll(model, data, done => is_gone || setMoments(done), () => is_gone).catch(error => is_gone || setWrong(error.message));
     return () => { is_gone = true; };
-  }, [model?.name, model?.active_version, data]);
-  return moments;
+  }, [model?.name, model?.active_version, data, retry]);
+  return { moments, wrong };
 }
 
 async function predictAll(model, { frames, actions, states }, tell, isGone) {
@@ -76,7 +81,8 @@ export function Episode({ dataset, number, models, parameters }) {
   // The best one, unless another or none was chosen.
   const model = parameters.model === undefined ? fitting[0] : fitting.find(({ name }) => name === parameters.model);
   const other = fitting.find(({ name }) => name === parameters.other);
-  const [first, second] = [usePredictions(model, data), usePredictions(other, data)];
+  const predicted = [usePredictions(model, data), usePredictions(other, data)];
+  const [first, second] = predicted.map(({ moments }) => moments);
   const player = usePlayer(data, dataset.frame_period_s, +parameters.frame || 0);
   if (wrong) return html`<p class="wrong" role="alert">${wrong}</p>`;
   if (!data) return html`<p class="quiet wait">Reading the episode…</p>`;
@@ -93,6 +99,7 @@ export function Episode({ dataset, number, models, parameters }) {
           ${model && !other && html`<${Picture} image=${first[at]?.predicted && frame} other=${first[at]?.predicted} caption="the difference" label="the difference" />
             <p class="key"><span><i class="brighter" /> recorded is brighter</span> <span><i class="darker" /> recorded is darker</span></p>`}
         </div>
+        ${predicted.map(({ wrong }) => wrong && html`<p class="wrong" role="alert">No predictions: ${wrong}</p>`)}
         <${Controls} player=${player} count=${data.frames.length} />
         <p class="quiet">frame ${at} of ${data.frames.length}, ${(data.times_s[at] ?? 0).toFixed(1)} s${data.frame_count > data.frames.length ? `; the first ${data.frames.length} of ${data.frame_count} frames` : ""}</p>
       </div>

@@ -14,9 +14,9 @@ const LOSSES_EVERY_MS = 1000;
 
 // The job as it is now, its log and its losses.
 export function useJob(id) {
-  const [known, setKnown] = useState({ job: null, lines: [], losses: [] });
+  const [known, setKnown] = useState({ job: null, lines: [], losses: [], wrong: "" });
   useEffect(() => {
-    setKnown({ job: null, lines: [], losses: [] });
+    setKnown({ job: null, lines: [], losses: [], wrong: "" });
     if (!id) return undefined;
     let read_ms = -Infinity, is_gone = false;
     const readLosses = async () => {
@@ -26,6 +26,7 @@ export function useJob(id) {
     };
     const stop = listen(`/v1/jobs/${id}/events`, (name, data) => {
       if (name === "log") setKnown(now => ({ ...now, lines: [...now.lines, data].slice(-MOST_LINES) }));
+      if (name === "refused") setKnown(now => ({ ...now, wrong: data }));
       if (name !== "job") return false;
       setKnown(now => ({ ...now, job: data }));
       const is_over = isFinal(data);

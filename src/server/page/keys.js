@@ -76,9 +76,17 @@ export function Pad() {
     };
   }, []);
   const up = name => () => hold(name, false);
+  // A focused button is held by its keys, too; Space means something else in a view.
+  const byKey = (name, down) => event => {
+    if (event.key !== " " && event.key !== "Enter") return;
+    event.preventDefault();
+    event.stopPropagation();
+    hold(name, down);
+  };
   return html`<div class="pad" role="group" aria-label="Drive">${BUTTONS.map(([name, key, arrow]) => html`
     <button class=${`${name} ${held.has(name) ? "down" : ""}`} aria-label=${`drive ${name}`} aria-pressed=${held.has(name)}
       onPointerDown=${() => hold(name, true)} onPointerUp=${up(name)} onPointerCancel=${up(name)} onPointerLeave=${up(name)}
+      onKeyDown=${byKey(name, true)} onKeyUp=${byKey(name, false)} onBlur=${up(name)}
       onContextMenu=${event => event.preventDefault()}><span aria-hidden="true">${arrow}</span><kbd>${key}</kbd></button>`)}
   </div>`;
 }

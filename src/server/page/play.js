@@ -85,7 +85,7 @@ function Verdict({ robot, score }) {
   const percent = score && !score.is_still ? 100 * score.of_guess : null;
   const words = !score ? "No prediction has come true yet"
     : score.is_still ? `Nothing moves; error ${levels(score.error).toFixed(1)} of 255 gray levels`
-    : `Error ${percent < 1000 ? percent.toFixed(0) : ">999"} % of that of ${score.best}`;
+    : `Error ${percent < 1000 ? percent.toFixed(0) : ">999"} % of the best simple guess (${score.best})`;
   const warnings = robot.history.at(-1)?.prediction?.warnings ?? [];
   return html`<div class=${`verdict ${is_unlike ? "bad" : ""}`}>
     <p class="line"><b>${words}</b>

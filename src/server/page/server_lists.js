@@ -47,6 +47,19 @@ async function readJobs() {
   }
 }
 
+// How long the page says that the server stops, before it only says that it tries again.
+const STOPPING_MS = 3000;
+
+// A number that grows whenever the connection is back after something failed.
+export function useRetry(has_failed) {
+  const { connection } = useLists();
+  const [count, setCount] = useState(0);
+  useEffect(() => {
+    if (connection === "connected" && has_failed) setCount(now => now + 1);
+  }, [connection]);
+  return count;
+}
+
 // A list that could not be read is read again after the next event; "lost" follows.
 const quietly = work => work().catch(() => {});
 
@@ -55,10 +68,15 @@ export function follow() {
   stop();
   // The first list need not wait for the events.
   quietly(readModels);
+  let stopping_ms = -Infinity;
   stop = listen("/v1/events", name => {
     if (name === "open") change({ connection: "connected", locked: null });
-    else if (name === "lost") change({ connection: "reconnecting" });
-    else if (name === "stopping") change({ connection: "stopping" });
+    else if (name === "lost") {
+      if (performance.now() - stopping_ms > STOPPING_MS) change({ connection: "reconnecting" });
+    } else if (name === "stopping") {
+      stopping_ms = performance.now();
+      change({ connection: "stopping" });
+    }
     else if (name === "models") quietly(readModels);
     else if (name === "jobs") quietly(readJobs);
   });

@@ -47,9 +47,14 @@ const proposedPreset = ({ scenario, camera }) => (!scenario ? "recording" : scen
 // Lines KEY=VALUE as nested settings: sequence.batch_size=16 is { sequence: { batch_size: 16 } }.
 function settingsOf(lines, steps) {
   const settings = {};
+  let wrong = "";
   for (const line of [...lines.split("\n"), steps && `sequence.steps=${steps}`]) {
     const [key, value] = (line || "").split(/=(.*)/s).map(part => part.trim());
-    if (!key || value === undefined) continue;
+    if (!key && value === undefined) continue;
+    if (!key || value === undefined) {
+      wrong = `“${line.trim()}” is no setting: write name=value, for example sequence.batch_size=16.`;
+      continue;
+    }
     const parts = key.split("."), last = parts.pop();
     // A value that an earlier line gave to a group stays, and the server refuses it.
     const place = parts.reduce((within, part) => (within[part] = Object(within[part] ?? {})), settings);
@@ -59,17 +64,17 @@ function settingsOf(lines, steps) {
       place[last] = value;
     }
   }
-  return settings;
+  return { settings, wrong };
 }
 
-// Steps and memory of a training, by the server; null until it is known or if the training is not valid.
+// Steps and memory of a training, by the server, and why it would be refused; null until it is known.
 function useEstimate(spec) {
-  const [found, setFound] = useState(null);
+  const [found, setFound] = useState({ needs: null, wrong: "" });
   const asked = JSON.stringify(spec);
   useEffect(() => {
     let is_old = false;
     // Not at every letter that is typed.
-    const timer = setTimeout(() => call("POST", "/v1/jobs/estimate", spec).then(estimate => { if (!is_old) setFound(estimate); }, () => { if (!is_old) setFound(null); }), ESTIMATE_AFTER_MS);
+    const timer = setTimeout(() => call("POST", "/v1/jobs/estimate", spec).then(needs => { if (!is_old) setFound({ needs, wrong: "" }); }, error => { if (!is_old) setFound({ needs: null, wrong: error.message }); }), ESTIMATE_AFTER_MS);
     return () => {
       is_old = true;
       clearTimeout(timer);
@@ -93,23 +98,24 @@ function NewTraining({ datasets, jobs, submit }) {
   const dataset = datasets.find(({ name }) => name === form.dataset) ?? datasets[0];
   const preset = form.preset || proposedPreset(dataset);
   const set = name => event => setForm({ ...form, [name]: event.target.value });
-  const settings = settingsOf(form.settings, form.steps);
+  const { settings, wrong } = settingsOf(form.settings, form.steps);
   const spec = { kind: "train", name: form.name || dataset.name, preset, dataset: dataset.name, ...(Object.keys(settings).length && { settings }) };
   const pace_s = secondsPerStep(jobs, preset);
-  const needs = useEstimate(spec);
+  const { needs, wrong: refused } = useEstimate(spec);
   const time = !pace_s ? "Time: not known, since no training of this preset has finished here yet; the job tells it after its first steps."
     : needs ? `Time: about ${duration(pace_s * needs.steps)} for ${needs.steps} steps, from the last training of this preset here.`
     : `Time: ${(1000 * pace_s).toFixed(0)} ms a step in the last training of this preset here.`;
   const limit = needs?.memory_limit_mib ? ` of ${memory(needs.memory_limit_mib)} that a job may use` : "";
   const room = needs ? `Memory: at least ${memory(needs.memory_mib)}${limit}.` : "";
   const is_refused = needs?.memory_limit_mib > 0 && needs.memory_mib > needs.memory_limit_mib;
-  return html`<form class="card" onSubmit=${event => { event.preventDefault(); submit(spec); }}><h2>New training</h2><div class="form">
+  return html`<form class="card" onSubmit=${event => { event.preventDefault(); if (!wrong) submit(spec); }}><h2>New training</h2><div class="form">
       <label>Data set <select value=${dataset.name} onChange=${set("dataset")}>${datasets.map(({ name }) => html`<option value=${name}>${name}</option>`)}</select></label>
       <label>Preset <select value=${preset} onChange=${set("preset")}>${(presets.length ? presets : [preset]).map(name => html`<option value=${name}>${name}</option>`)}</select></label>
       <label>Name of the model <input value=${form.name} placeholder=${dataset.name} pattern="[a-z0-9][a-z0-9\\-]*" onInput=${set("name")} /></label>
       <label>Steps <input type="number" min="1" value=${form.steps} placeholder="of the preset" onInput=${set("steps")} /></label>
       <label class="wide">Other settings, one a line <textarea rows="2" value=${form.settings} placeholder="sequence.batch_size=16" onInput=${set("settings")} /></label>
     </div><p class="quiet estimate">${time} ${room}</p>${is_refused && html`<p class="wrong">It would be refused: use a smaller model or batch.</p>`}
+    <p class="wrong" role="alert">${wrong || (refused && `It would be refused: ${refused}`)}</p>
     <div class="actions"><button class="main">Train</button><${Copy} curl=${() => curl("POST", "/v1/jobs", spec)} python=${() => requests("POST", "/v1/jobs", spec)} /></div></form>`;
 }
 
@@ -117,12 +123,13 @@ function NewEvaluation({ models, datasets, submit }) {
   const [form, setForm] = useState({});
   const model = form.model ?? models[0]?.name;
   const dataset = form.dataset ?? datasets[0].name;
-  const spec = { kind: "evaluate", model, dataset };
+  const spec = { kind: "evaluate", model, dataset, ...(form.windows && { windows: +form.windows }) };
   const set = name => event => setForm({ ...form, [name]: event.target.value });
   return models.length > 0 && html`<form class="card" onSubmit=${event => { event.preventDefault(); submit(spec); }}><h2>New evaluation</h2><div class="form">
       <label>Model <select value=${model} onChange=${set("model")}>${models.map(({ name }) => html`<option value=${name}>${name}</option>`)}</select></label>
       <label>Data set <select value=${dataset} onChange=${set("dataset")}>${datasets.map(({ name }) => html`<option value=${name}>${name}</option>`)}</select></label>
-    </div><p class="quiet">Compares the model with baselines on trials that training did not use, and writes a report.</p>
+      <label>Windows of each test set <input type="number" min="1" max="100000" value=${form.windows} placeholder="2000" onInput=${set("windows")} /></label>
+    </div><p class="quiet">Fewer windows are faster, with wider intervals. Compares the model with baselines on trials that training did not use, and writes a report.</p>
     <div class="actions"><button class="main">Evaluate</button><${Copy} curl=${() => curl("POST", "/v1/jobs", spec)} python=${() => requests("POST", "/v1/jobs", spec)} /></div></form>`;
 }
 
@@ -136,7 +143,8 @@ function Jobs({ jobs, chosen }) {
 
 // The chosen job as it goes on.
 function Watched({ id, jobs }) {
-  const { job, lines, losses } = useJob(id);
+  const { job, lines, losses, wrong } = useJob(id);
+  if (wrong) return html`<p class="wrong" role="alert">${wrong}</p>`;
   if (!job) return html`<p class="quiet wait">Reading ${id}…</p>`;
   return html`<div class="watched">
     <h2>${id}: ${titleOf(job.spec)} <span class=${STATES[job.state]}>${job.state}</span></h2>

@@ -80,6 +80,8 @@ export function WhatIf({ robot }) {
   }
   const note = plans.length ? (robot.status === "reconnecting" ? "reconnecting" : "") : noteOf(robot, robot.history.at(-1)) || "asking the model";
   const is_moving = robot.plan.length > 0;
+  // Not `disabled`, which would take the focus away from who presses it by a key.
+  const can_take = plans.length > 0 && !is_moving && robot.is_drivable;
   return html`<section class="what-if">
     <h1 class="visually-hidden">What if</h1>
     <p>Nine ways to drive for the next ${horizon_s} s, each as the model expects the camera to see it. <b>Best</b> is the one that ends with the view that is most like the goal: that picture you choose.</p>
@@ -90,7 +92,7 @@ export function WhatIf({ robot }) {
     </div>
     <div class="toolbar">
       <button onClick=${() => setGoal(frame)} disabled=${!frame}>make the present frame the goal</button>
-      <button class="main" disabled=${!plans.length || is_moving || !robot.is_drivable} onClick=${() => take(plans[best])}>take the best</button>
+      <button class="main" aria-disabled=${!can_take} onClick=${() => can_take && take(plans[best])}>take the best</button>
       <label><input type="checkbox" checked=${follows} disabled=${!robot.is_drivable} onChange=${event => setFollows(event.target.checked)} /> keep taking the best</label>
       ${!robot.is_drivable && html`<span class="quiet">A recording cannot take a plan.</span>`}
     </div>
@@ -98,7 +100,7 @@ export function WhatIf({ robot }) {
     <h2>What the next ${horizon_s} s would look like</h2>
     <p class="quiet">Click one, and the robot takes it. Its cost is the difference between its last predicted frame and the goal, in gray levels, ± the error to expect.</p>
     <div class="plans">${(plans.length ? plans : PLANS.map(([name, , , color]) => ({ name, color, frames: [] }))).map((plan, place) => html`
-      <button class=${`plan ${place === best && plans.length ? "best" : ""}`} disabled=${!plans.length || is_moving || !robot.is_drivable} onClick=${() => take(plan)}>
+      <button class=${`plan ${place === best && plans.length ? "best" : ""}`} aria-disabled=${!can_take} onClick=${() => can_take && take(plan)}>
         <h3><i style=${{ background: `var(${plan.color})` }} />${plan.name}${place === best && plans.length ? html` <span class="mark">best</span>` : ""}</h3>
         <${Picture} image=${plan.frames[step] ?? frame} label=${`predicted for ${plan.name}`} note=${plans.length ? "" : note} />
         <p>${plans.length ? html`cost <b>${levels(costs[place]).toFixed(1)}</b>${plan.expected === undefined ? "" : ` ±\u00a0${levels(plan.expected).toFixed(1)}`}` : "…"}</p>

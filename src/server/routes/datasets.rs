@@ -1,6 +1,7 @@
 //! The data sets, and pictures of their episodes.
 
 use std::path::PathBuf;
+use std::sync::atomic::Ordering;
 
 use axum::body::Bytes;
 use axum::http::{StatusCode, header};
@@ -126,6 +127,7 @@ async fn delete(app: App, author: Author, Path(name): Path<String>) -> Result<St
         return Err(JobError::InUse { name, job: job.id }.into());
     }
     datasets::delete(app.store(), &name, &author).await.map_err(absent)?;
+    app.deleted_datasets.fetch_add(1, Ordering::Relaxed);
     Ok(StatusCode::NO_CONTENT)
 }
 

@@ -3,6 +3,7 @@
 use std::collections::hash_map::DefaultHasher;
 use std::convert::Infallible;
 use std::hash::{Hash as _, Hasher as _};
+use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 use axum::response::sse::{Event, KeepAlive, Sse};
@@ -37,7 +38,7 @@ struct ServerEvent {
 }
 
 /// Sends an event when the list of models or its active versions changed (`event: models`), when the state of a job changed
-/// or a new one came (`event: jobs`), and when the server stops (`event: stopping`). Both lists are announced once at the
+/// or a new one came, or a data set was deleted (`event: jobs`), and when the server stops (`event: stopping`). Both lists are announced once at the
 /// beginning. The events do not hold the change: read the list. The stream also ends if the API key is revoked.
 #[utoipa::path(
     get, path = "/v1/events",
@@ -109,6 +110,7 @@ impl ServerEventStream {
             ..JobFilter::default()
         };
         let mut hasher = DefaultHasher::new();
+        self.app.deleted_datasets.load(Ordering::Relaxed).hash(&mut hasher);
         for job in self.app.jobs().list(filter).await.ok()? {
             (job.id.to_string(), job.state.name(), job.cancelling).hash(&mut hasher);
         }

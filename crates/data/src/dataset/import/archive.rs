@@ -11,9 +11,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use flate2::read::MultiGzDecoder;
 
 use self::unpacker::Unpacker;
-use super::error::moved_text;
 use super::files::{entries, open_file};
-use super::skipped::SkippedItem;
+use super::skipped::{SkippedItem, moved_text};
 use super::{ImportConfig, ImportError};
 use foreframe_core::files::remove_dir;
 

@@ -4,7 +4,7 @@ use std::fmt::Display;
 use std::io;
 use std::path::{Path, PathBuf};
 
-use super::skipped::{SkippedItem, SkippedList};
+use super::skipped::{SkippedItem, SkippedList, moved_text};
 use crate::dataset::error::DatasetError;
 use foreframe_core::error_kind::{ErrorKind, HasErrorKind};
 use foreframe_core::files::is_transient;
@@ -199,9 +199,4 @@ impl ImportError {
         });
         Ok(())
     }
-}
-
-/// A text that names paths below one folder, with those below another instead.
-pub(super) fn moved_text(text: &str, from: &Path, to: &Path) -> String {
-    text.replace(&*from.to_string_lossy(), &to.to_string_lossy())
 }

@@ -260,9 +260,8 @@ impl Header<'_> {
         })
     }
 
-    /// What is said about columns that nobody asked for, where no column was named.
+    /// What is said about columns that nobody asked for.
     fn note_on_unused(&self, columns: &Columns) -> Vec<String> {
-        let options = self.options;
         let time = columns.time.map(|(column, _)| column);
         let is_used = |column: &usize| {
             let (column, chosen) = (*column, columns.actions.iter().chain(&columns.states));
@@ -270,7 +269,7 @@ impl Header<'_> {
         };
         let unused = (0..self.names.len()).filter(|column| !is_used(column));
         let names: Vec<&str> = unused.map(|column| name_and_unit(&self.names[column]).0).collect();
-        if names.is_empty() || !options.actions.is_empty() || !options.states.is_empty() {
+        if names.is_empty() {
             return Vec::new();
         }
         vec![format!(

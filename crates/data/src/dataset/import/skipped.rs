@@ -2,7 +2,6 @@
 
 use std::path::Path;
 
-use super::error::moved_text;
 use serde::{Deserialize, Serialize};
 
 /// How many items are listed; more are only counted, so that a recording with endless damage needs little memory.
@@ -50,6 +49,11 @@ pub(super) fn shortened(text: &str, bytes: usize) -> String {
         return text.to_owned();
     }
     format!("{}…", &text[..text.floor_char_boundary(bytes)])
+}
+
+/// A text that names paths below one folder, with those below another instead.
+pub(super) fn moved_text(text: &str, from: &Path, to: &Path) -> String {
+    text.replace(&*from.to_string_lossy(), &to.to_string_lossy())
 }
 
 /// Names for a message, with commas; of many, the first ones.
