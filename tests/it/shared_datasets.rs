@@ -35,7 +35,11 @@ fn collect(trials: u32) -> Value {
 
 /// Creates a collection job and waits until it has succeeded.
 async fn collected(app: &App, trials: u32) {
-    let taken = post(app, JOBS, &collect(trials)).await;
+    finished(app, &collect(trials)).await;
+}
+
+async fn finished(app: &App, job: &Value) {
+    let taken = post(app, JOBS, job).await;
     assert_eq!(taken.status, 202, "{}", taken.json());
     let path = format!("{JOBS}/{}", taken.json()["id"].as_str().unwrap());
     poll_until(async || {
@@ -66,6 +70,29 @@ async fn describing_a_shared_data_set_does_not_download_it() {
     let picture = get(&other, &format!("{SET}/episodes/2/preview.png")).await;
     assert!(picture.body.starts_with(b"\x89PNG"));
     assert!(there.path().join("datasets/d/meta/info.json").is_file());
+}
+
+#[tokio::test]
+async fn an_episode_tells_its_camera() {
+    let objects = tempfile::tempdir().unwrap();
+    let (_here, app) = machine(objects.path()).await;
+    let varied = json!({"kind": "collect", "name": "d", "scenario": "moving-observer", "trials": 2, "rooms": "varied", "seed": 1});
+    finished(&app, &varied).await;
+    let camera = async |episode: usize| get(&app, &format!("{SET}/episodes/{episode}")).await.json()["camera"].clone();
+    let (first, second) = (camera(0).await, camera(1).await);
+    assert!(
+        first["height_m"].is_f64() && second["height_m"].is_f64(),
+        "{first} {second}"
+    );
+    assert_ne!(first, second);
+    // As a session takes it.
+    let session = json!({"model": "rooms", "camera": first});
+    let answer = post(&app, "/v1/sessions", &session).await;
+    assert!(
+        answer.json()["detail"].as_str().unwrap().contains("no model"),
+        "{}",
+        answer.json()
+    );
 }
 
 #[tokio::test]

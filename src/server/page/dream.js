@@ -50,7 +50,7 @@ class Dreaming {
   // The model's answer to its context: the first imagined frame is that of the moment that comes now.
   async fallAsleep() {
     const { context, model } = this.robot;
-    this.stream = await Stream.open(model.name, context.at(-1).camera);
+    this.stream = await Stream.open(model, context.at(-1).camera);
     if (this.is_over) return this.stream.close();
     const answer = await sendAll(this.stream, context);
     const last = context.at(-1);

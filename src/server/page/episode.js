@@ -53,9 +53,9 @@ function usePredictions(model, data) {
   return { moments, wrong };
 }
 
-async function predictAll(model, { frames, actions, states }, tell, isGone) {
+async function predictAll(model, { frames, actions, states, camera }, tell, isGone) {
   const { spec } = model;
-  const stream = await Stream.open(model.name);
+  const stream = await Stream.open(model, camera);
   const history = [];
   try {
     let answers = [];
@@ -66,7 +66,7 @@ async function predictAll(model, { frames, actions, states }, tell, isGone) {
       answers = [...answers, await stream.send({ ...moment, plan: plan.length === spec.horizon ? plan : undefined })].slice(-spec.horizon - 1);
       history.push(moment);
       const past = lookBack(history, spec);
-      if (past && answers[0].type === "prediction") Object.assign(moment, compare(moment, past, answers[0], spec, cameraOf(model)));
+      if (past && answers[0].type === "prediction") Object.assign(moment, compare(moment, past, answers[0], spec, camera ?? cameraOf(model)));
       if (place % TOLD_EVERY === 0) tell([...history]);
     }
     tell([...history]);

@@ -58,7 +58,7 @@ export function Play({ robot }) {
       ${driving}
     </div>
     <footer><${Copy} python=${() => program(robot)}
-      curl=${() => curl("GET", `/v1/models/${robot.model.name}/preview.png`, undefined, " -o preview.png")} />
+      curl=${() => curl("POST", `/v1/models/${robot.model.name}/predict`, predictionBody(robot), " -H 'Accept: image/png' -o prediction.png")} />
       <a href="/docs">API</a></footer>
   </section>`;
 }
@@ -66,8 +66,12 @@ export function Play({ robot }) {
 // A stream from the simulator; for a recording, one prediction of its present frames.
 function program({ model, source_id, context }) {
   if (!source_id.startsWith("set:")) return streamInPython(model.name, model.lineage.scenario, source_id === VARIED);
+  return requests("POST", `/v1/models/${model.name}/predict`, predictionBody({ model, context }));
+}
+
+function predictionBody({ model, context }) {
   const actions = takesActions(model) ? { actions: context.map(({ action }) => action) } : {};
-  return requests("POST", `/v1/models/${model.name}/predict`, { ...contextBody(model, context), ...actions });
+  return { ...contextBody(model, context), ...actions };
 }
 
 const label = (spec, step) => ((step + 1) * spec.frame_period_s).toFixed(1);

@@ -130,8 +130,8 @@ export class Robot {
   async openStreams() {
     this.closeStreams();
     const { model, now, spec: { horizon, context } } = this;
-    this.stream = await Stream.open(model.name, now.camera);
-    this.late = await Stream.open(model.name, now.camera);
+    this.stream = await Stream.open(model, now.camera);
+    this.late = await Stream.open(model, now.camera);
     if (now.begins) return;
     await sendAll(this.stream, this.context.slice(1 - context));
     await sendAll(this.late, this.episode_moments.slice(0, -horizon).slice(1 - context));

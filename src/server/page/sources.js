@@ -117,8 +117,8 @@ class Recording {
   }
 
   moment() {
-    const { frames, states, actions } = this.episode;
-    return { frame: frames[this.at], state: states[this.at], driver: actions[this.at] ?? [], begins: this.at === 0 };
+    const { frames, states, actions, camera } = this.episode;
+    return { frame: frames[this.at], state: states[this.at], driver: actions[this.at] ?? [], begins: this.at === 0, camera };
   }
 
   async step() {

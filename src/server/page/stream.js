@@ -3,12 +3,15 @@
 import { call, deleteAtEnd, keyProtocols } from "./api.js";
 import { toBytes } from "./base64.js";
 import { Gray, raw } from "./gray.js";
+import { estimatesDepth } from "./server_lists.js";
 
 export class Stream {
-  // Resolves when the server is ready for the first frame. Another camera than the model's needs a session.
+  // Resolves when the server is ready for the first frame. Another camera than the model's needs a session, and a model with a
+  // use for it.
   static async open(model, camera) {
-    if (!camera) return Stream.connect(`/v1/models/${model}/stream`);
-    const { id, token } = await call("POST", "/v1/sessions", { model, camera });
+    const { name } = model;
+    if (!camera || !estimatesDepth(model)) return Stream.connect(`/v1/models/${name}/stream`);
+    const { id, token } = await call("POST", "/v1/sessions", { model: name, camera });
     return Object.assign(await Stream.connect(`/v1/sessions/${id}/stream?token=${token}`), { session: `/v1/sessions/${id}?token=${token}` });
   }
 

@@ -15,6 +15,7 @@ use crate::server::http::problem::ApiError;
 use crate::server::images::{self, ImageBytes, ImageFormat};
 use crate::server::state::App;
 use foreframe_core::frame::Frame;
+use foreframe_core::frame::warp::CameraModel;
 use foreframe_data::dataset::{Dataset, DatasetInfo, EpisodeData};
 use foreframe_data::inspection;
 
@@ -59,6 +60,9 @@ struct EpisodeFrames {
     actions: Vec<Vec<f32>>,
     /// The state at each frame, in the order and units of the data set's `states`.
     states: Vec<Vec<f32>>,
+    /// The camera, if it is known.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    camera: Option<CameraModel>,
 }
 
 /// Frames of an episode with their times, actions and states.
@@ -111,6 +115,7 @@ impl EpisodeFrames {
             times_s: data.timestamps_s.iter().skip(from).take(limit).copied().collect(),
             actions: rows(&data.actions, info.action_channels.len()),
             states: rows(&data.states, info.state_channels.len()),
+            camera: info.camera_of(data.trial.as_ref()),
         })
     }
 }

@@ -60,6 +60,16 @@ impl DatasetInfo {
         world.map(|world| &world.camera)
     }
 
+    /// The camera of an episode with this trial: that of the trial, else the one of all trials, both with their height, else the one
+    /// in the description.
+    #[doc(hidden)]
+    #[must_use]
+    pub fn camera_of(&self, trial: Option<&TrialParameters>) -> Option<CameraModel> {
+        let own = trial.and_then(|trial| trial.room.as_ref()).map(|room| &room.camera);
+        let simulated = own.or_else(|| self.common_camera());
+        simulated.map(CameraConfig::model_with_height).or(self.camera)
+    }
+
     /// Number of frames and masks.
     pub(super) fn image_count(&self) -> usize {
         self.frame_count * (1 + usize::from(self.has_masks))

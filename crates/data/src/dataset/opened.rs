@@ -11,7 +11,6 @@ use super::frame_store::{FrameContent, FrameStore};
 use super::{DatasetError, DatasetInfo, DatasetPart, Episode, EpisodeData};
 use foreframe_core::frame::Frame;
 use foreframe_core::frame::warp::CameraModel;
-use foreframe_sim::CameraConfig;
 
 /// An open data set.
 #[derive(Clone, Debug, PartialEq)]
@@ -153,10 +152,7 @@ impl Dataset {
     #[must_use]
     pub fn camera(&self, episode: usize) -> Option<CameraModel> {
         let trial = self.episodes.get(episode).and_then(|episode| episode.trial.as_ref());
-        let own = trial.and_then(|trial| trial.room.as_ref()).map(|room| &room.camera);
-        let info = self.info_of(episode);
-        let simulated = own.or_else(|| info.common_camera());
-        simulated.map(CameraConfig::model_with_height).or(info.camera)
+        self.info_of(episode).camera_of(trial)
     }
 
     /// The camera of each of the episodes, given by position; empty unless all are known.
