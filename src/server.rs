@@ -8,6 +8,7 @@
 
 mod admin;
 mod blocking;
+mod bounded_list;
 mod config;
 mod environments;
 mod http;

@@ -56,6 +56,11 @@ impl RobotConnection {
         let host = uri.host().ok_or_else(wrong)?.trim_matches(['[', ']']).to_owned();
         let port = uri.port_u16().unwrap_or(DEFAULT_PORT);
         let tls = match uri.scheme_str() {
+            Some("ws") if ca_certificate.is_some() => {
+                return Err(BridgeError::Tls(
+                    "--ca-certificate is for wss://; ws:// has no certificate".to_owned(),
+                ));
+            }
             Some("ws") => None,
             Some("wss") => Some(RobotTls::new(ca_certificate.as_deref())?),
             _ => return Err(wrong()),

@@ -135,6 +135,11 @@ async fn bad_plans_are_refused_with_the_field() {
         ),
         (
             Some(1),
+            Some(with("goal", json!({"image": "A".repeat(1_500_000)}))),
+            "goal.image has 1125000 bytes; a stream keeps at most 1048576",
+        ),
+        (
+            Some(1),
             Some(with("search", json!({}))),
             "model \"moving\" is not calibrated, so the ranges of its actions are not known; give limits",
         ),
@@ -161,6 +166,16 @@ async fn bad_plans_are_refused_with_the_field() {
     let refused = client.receive().await;
     assert!(
         matches!(&refused, ServerMessage::Error { code: ErrorCode::Malformed, detail, .. } if detail.contains("unknown field `place`")),
+        "{refused:?}"
+    );
+    // An empty list is three bytes here and 24 in memory.
+    let mut many = body(0.5, &json!({}));
+    many["present"] = json!(vec![[0.0; 0]; 5000]);
+    let many = json!({"type": "configure", "plan_every": 1, "plan_request": many});
+    client.send_text(&many.to_string()).await;
+    let refused = client.receive().await;
+    assert!(
+        matches!(&refused, ServerMessage::Error { code: ErrorCode::Malformed, detail, .. } if detail.contains("more than 4096 items")),
         "{refused:?}"
     );
     server.stop().await;

@@ -179,6 +179,9 @@ class SessionFlow:
         """Asks for a plan with every so many predictions; 0: for none."""
         if frames < 0 or (frames > 0 and goal is None):
             raise ValueError(f"plan_every is {frames}, and the goal {goal}; give 1 or more with a goal, or 0")
+        if frames == 0:
+            # A new stream is not told of them any more.
+            self._plans = None
         yield from self.open()
         assert self.spec is not None
         plans: dict[str, Any] = {"plan_every": frames}
@@ -186,11 +189,12 @@ class SessionFlow:
             plans["plan_request"] = calls.session_plan_body(self.spec, goal, with_obstacles, search)
         before, self._plans = self._plans, plans
         try:
-            yield from self._configure_plans()
-        except Broken:
-            # A new stream is told of them when it is opened.
-            self._is_open = False
-            yield from self.open()
+            try:
+                yield from self._configure_plans()
+            except Broken:
+                # A new stream is told of them when it is opened.
+                self._is_open = False
+                yield from self.open()
         except StreamError:
             self._plans = before
             raise
@@ -323,7 +327,12 @@ class SessionFlow:
         ready = yield from self._receive()
         self.spec, self.version = Spec.of(ready["spec"]), ready["version"]
         if self._plans is not None:
-            yield from self._configure_plans()
+            try:
+                yield from self._configure_plans()
+            except StreamError:
+                # Told once: a model that refuses the goal still predicts.
+                self._plans = None
+                raise
         return ready
 
     def _configure_plans(self) -> Flow[None]:

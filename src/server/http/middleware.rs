@@ -94,11 +94,16 @@ pub(in crate::server) async fn trace(State(trace): State<RequestTrace>, request:
         let answered = async {
             refuse_encoded(request.headers())?;
             let (request, has_arrived) = with_arrival(request);
+            let may_be_done = if request.method().is_safe() {
+                ""
+            } else {
+                "; what was asked for may still be done, so look before you repeat it"
+            };
             let late = |_| {
                 let limit_ms = limit.as_millis();
                 if has_arrived.load(Ordering::Acquire) {
                     // It is not the client that was slow.
-                    return ApiError::unavailable(format!("no answer was ready within {limit_ms} ms"));
+                    return ApiError::unavailable(format!("no answer was ready within {limit_ms} ms{may_be_done}"));
                 }
                 ApiError::Timeout(format!(
                     "the request took longer than {limit_ms} ms to arrive and be answered"

@@ -6,6 +6,7 @@ use std::time::Duration;
 use serde::{Deserialize, Serialize};
 
 use super::response::PlanForm;
+use crate::server::bounded_list::{list, rows};
 use crate::server::config::ServerConfig;
 use crate::server::http::multipart::check_count;
 use crate::server::http::problem::{ApiError, unfit};
@@ -48,7 +49,7 @@ pub(in crate::server) struct PlanSearch {
     #[schema(value_type = BTreeMap<String, f32>)]
     costs: BTreeMap<PlanCost, f32>,
     /// Limits of the action channels, in their order. Default: the ranges of the training.
-    #[serde(skip_serializing_if = "Option::is_none")]
+    #[serde(deserialize_with = "list", skip_serializing_if = "Option::is_none")]
     limits: Option<Vec<ActionLimit>>,
     /// Actions of a plan. Default: the model's horizon.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -95,7 +96,7 @@ pub struct SessionPlanRequest {
     #[serde(default)]
     format: ImageFormat,
     /// The robot's state. Default: its state at the session's last frame.
-    #[serde(skip_serializing_if = "Option::is_none")]
+    #[serde(default, deserialize_with = "list", skip_serializing_if = "Option::is_none")]
     state: Option<Vec<f32>>,
     /// What to reach.
     goal: PlanGoal,
@@ -103,10 +104,10 @@ pub struct SessionPlanRequest {
     #[serde(default)]
     search: PlanSearch,
     /// The plan that the robot follows now. Default: that of the session's last frame.
-    #[serde(skip_serializing_if = "Option::is_none")]
+    #[serde(default, deserialize_with = "rows", skip_serializing_if = "Option::is_none")]
     present: Option<Vec<Vec<f32>>>,
     /// The action before the plan, from which `max_change` is counted first.
-    #[serde(skip_serializing_if = "Option::is_none")]
+    #[serde(default, deserialize_with = "list", skip_serializing_if = "Option::is_none")]
     action: Option<Vec<f32>>,
     /// Whether the answer has the predicted frames.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
@@ -117,6 +118,11 @@ pub struct SessionPlanRequest {
 }
 
 impl SessionPlanRequest {
+    /// The bytes of the goal's image, as they came.
+    pub(in crate::server) fn image_bytes(&self) -> usize {
+        self.goal.image.as_ref().map_or(0, |image| image.0.len())
+    }
+
     /// How the answer is given.
     pub(in crate::server) fn form(&self) -> PlanForm {
         PlanForm {

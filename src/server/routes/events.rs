@@ -38,7 +38,7 @@ struct ServerEvent {
 }
 
 /// Sends an event when the list of models or its active versions changed (`event: models`), when the state of a job changed
-/// or a new one came, or a data set was deleted (`event: jobs`), and when the server stops (`event: stopping`). Both lists are announced once at the
+/// or a new one came, or a data set was deleted by this server (`event: jobs`), and when the server stops (`event: stopping`). Both lists are announced once at the
 /// beginning. The events do not hold the change: read the list. The stream also ends if the API key is revoked.
 #[utoipa::path(
     get, path = "/v1/events",

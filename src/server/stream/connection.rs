@@ -10,7 +10,7 @@ use axum::extract::ws::{CloseFrame, Message, WebSocket};
 use futures_util::stream::{SplitSink, SplitStream};
 use futures_util::{FutureExt as _, SinkExt as _, StreamExt as _};
 use metrics::{Counter, counter};
-use tokio::sync::mpsc;
+use tokio::sync::{mpsc, oneshot};
 use tokio::time::{Instant, timeout};
 use tracing::{debug, info, trace};
 
@@ -32,7 +32,8 @@ use foreframe_core::metric_names;
 /// A message that is answered in the order in which it came.
 enum PipelinedItem {
     Frame(Box<FrameStep>),
-    Configure(Box<ConfigureMessage>),
+    /// With what is dropped when it is answered.
+    Configure(Box<ConfigureMessage>, oneshot::Sender<Infallible>),
     Refused(ErrorCode, String),
 }
 
@@ -173,8 +174,13 @@ impl StreamConnection {
                     )
                 }
                 Ok(ClientMessage::Configure(message)) => {
-                    resize = message.resize.or(resize);
-                    PipelinedItem::Configure(Box::new(message))
+                    // It can be large, and refused: nothing more is read until it is answered.
+                    let (is_answered, answered) = oneshot::channel();
+                    let item = PipelinedItem::Configure(Box::new(message), is_answered);
+                    inbox.send(item).await.map_err(|_| ClientGone)?;
+                    let _ = answered.await;
+                    resize = self.ownership.session.settings().resize;
+                    continue;
                 }
                 Ok(ClientMessage::Ping(ping)) => {
                     let timestamp_us = ping.timestamp_us;
@@ -244,7 +250,7 @@ impl StreamConnection {
                         Err(error) => self.error(error.code(), without_middle(&error)),
                     }
                 }
-                PipelinedItem::Configure(message) => self.configure(&message, &mut schedule).await,
+                PipelinedItem::Configure(message, _is_answered) => self.configure(&message, &mut schedule).await,
                 PipelinedItem::Refused(code, detail) => self.error(code, detail),
             };
             if let ServerMessage::Overtaken { .. } = answer {

@@ -14,9 +14,13 @@ use crate::server::plans::request::SessionPlanRequest;
 use crate::server::plans::response::PlanResponse;
 use crate::server::plans::search::PlanTask;
 use foreframe_core::error_text::without_middle;
+use foreframe_core::frame::resize::Resize;
 use foreframe_core::planning::{PlanContext, Planner};
 use foreframe_core::serving::SessionState;
 use foreframe_core::types::RobotState;
+
+/// How large the image of a goal may be that a stream keeps, in bytes.
+const MAX_IMAGE_BYTES: usize = 1 << 20;
 
 /// Which frames get a plan.
 pub(super) struct PlanSchedule {
@@ -63,7 +67,13 @@ impl PlanSchedule {
     ) -> Result<(), ApiError> {
         let every = message.plan_every.unwrap_or(self.every);
         if let Some(request) = &message.plan_request {
-            check(request.as_ref().clone(), session, services).await?;
+            let bytes = request.image_bytes();
+            if bytes > MAX_IMAGE_BYTES {
+                return Err(ApiError::Unprocessable(format!(
+                    "goal.image has {bytes} bytes; a stream keeps at most {MAX_IMAGE_BYTES}"
+                )));
+            }
+            check(request.as_ref().clone(), message.resize, session, services).await?;
             self.request = Some(request.clone());
         } else if every > 0 && self.request.is_none() {
             return Err(ApiError::Unprocessable(format!(
@@ -112,11 +122,16 @@ impl PlanSchedule {
 }
 
 /// Errors: what of the request does not fit the model.
-async fn check(request: SessionPlanRequest, session: &Session, services: &StreamServices) -> Result<(), ApiError> {
+async fn check(
+    request: SessionPlanRequest,
+    resize: Option<Resize>,
+    session: &Session,
+    services: &StreamServices,
+) -> Result<(), ApiError> {
     let (model, config) = (Arc::clone(&session.model), Arc::clone(&services.config));
     let (state, settings) = session.state();
     let check = move || {
-        let mut input = request.into_input(&state, settings.resize, &model.manifest, &config)?;
+        let mut input = request.into_input(&state, resize.or(settings.resize), &model.manifest, &config)?;
         let states = &model.spec().states;
         if input.state.is_none() && !states.is_empty() {
             // It comes with the frames.

@@ -204,8 +204,12 @@ impl Objects {
             return Ok(Vec::new());
         };
         let prefix = Key::from(dir);
-        let listed = shared.list(Some(&prefix)).try_collect();
-        in_time(listed).await.map_err(failed("list", &prefix))
+        let (mut objects, mut found) = (shared.list(Some(&prefix)), Vec::new());
+        // A long list comes in pages.
+        while let Some(object) = in_time(objects.try_next()).await.map_err(failed("list", &prefix))? {
+            found.push(object);
+        }
+        Ok(found)
     }
 }
 

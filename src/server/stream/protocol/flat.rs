@@ -1,16 +1,13 @@
 //! A client's message while it is read: each field goes into its own type at once. What serde derives for the tagged enum
 //! would first store the whole message in a form that takes up to a hundred times its bytes.
 
-use serde::de::{Error as _, SeqAccess, Visitor};
-use serde::{Deserialize, Deserializer};
+use serde::Deserialize;
 
 use super::{ClientMessage, CloseMessage, ConfigureMessage, FrameMessage, OnGap, OnLate, PingMessage};
+use crate::server::bounded_list::List;
 use crate::server::images::{ImageBytes, ImageFormat};
 use crate::server::plans::request::SessionPlanRequest;
 use foreframe_core::frame::resize::Resize;
-
-/// The maximum number of items of a list in a message: more than any model takes.
-const MAX_ITEMS: usize = 4096;
 
 /// Every field that any message has.
 #[derive(Deserialize)]
@@ -39,38 +36,6 @@ enum MessageKind {
     Configure,
     Ping,
     Close,
-}
-
-/// A list; the first item over the limit is an error.
-struct List<T>(Vec<T>);
-
-impl<'de, T: Deserialize<'de>> Deserialize<'de> for List<T> {
-    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        deserializer.deserialize_seq(ListVisitor(std::marker::PhantomData))
-    }
-}
-
-struct ListVisitor<T>(std::marker::PhantomData<T>);
-
-impl<'de, T: Deserialize<'de>> Visitor<'de> for ListVisitor<T> {
-    type Value = List<T>;
-
-    fn expecting(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str("a list")
-    }
-
-    fn visit_seq<A: SeqAccess<'de>>(self, mut items: A) -> Result<List<T>, A::Error> {
-        let mut list = Vec::new();
-        while let Some(item) = items.next_element()? {
-            if list.len() == MAX_ITEMS {
-                return Err(A::Error::custom(format_args!(
-                    "the list has more than {MAX_ITEMS} items"
-                )));
-            }
-            list.push(item);
-        }
-        Ok(List(list))
-    }
 }
 
 impl TryFrom<AnyMessage> for ClientMessage {

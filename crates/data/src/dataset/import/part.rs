@@ -67,7 +67,7 @@ pub(super) fn write(
                 ImportError::Stopped => ImportError::Cancelled { done, total },
                 other => other,
             })?;
-            saved.save(&info, shard, made, (&part.dir, &config.out))?;
+            saved.save(&info, shard, made, &part.dir)?;
         }
         done += frames(episodes);
         on_progress(ImportProgress { done, total });

@@ -14,6 +14,10 @@ use crate::dataset::collect::unfinished;
 use crate::dataset::info::DatasetInfo;
 use crate::dataset::store::files::write_atomically;
 
+/// Instead of a path of the machine that saves a shard: the directory in which a source is unpacked, and the source.
+const UNPACKED: &str = "{unpacked}";
+const SOURCE: &str = "{source}";
+
 /// What is saved of a shard besides its episodes, and after them.
 #[derive(Serialize, Deserialize)]
 struct SavedShard {
@@ -26,13 +30,18 @@ struct SavedShard {
 pub(super) struct SavedShards<'a> {
     plan: String,
     dirs: &'a [PathBuf],
+    /// The data set's directory and the source on this machine: what was left out is named by paths in them.
+    places: [PathBuf; 2],
 }
 
 impl<'a> SavedShards<'a> {
     /// Those in these directories that belong to a plan.
     pub(super) fn new(config: &ImportConfig, plan: &ImportPlan, dirs: &'a [PathBuf]) -> Self {
-        let plan = hash(config, plan);
-        Self { plan, dirs }
+        Self {
+            plan: hash(config, plan),
+            dirs,
+            places: [config.out.clone(), config.source.clone()],
+        }
     }
 
     /// A shard, unless it is missing, damaged or of another plan.
@@ -40,25 +49,28 @@ impl<'a> SavedShards<'a> {
         let mut found = self.dirs.iter().map(|dir| (dir, saved_shard(dir, shard)));
         let (dir, saved) =
             found.find_map(|(dir, saved)| Some((dir, saved.filter(|saved| saved.plan == self.plan)?)))?;
+        let here = [Path::new(UNPACKED), Path::new(SOURCE)].into_iter().zip(&self.places);
         Some(EncodedShard {
             encoded: unfinished::read(info, dir, shard).ok()?,
-            bad: saved.bad,
+            bad: here.fold(saved.bad, |bad, (name, place)| bad.moved(name, place)),
         })
     }
 
-    /// Saves a shard in the directory `here`. What was left out is named as if it had been unpacked in the directory `there`.
-    /// Errors: `Io`, `Dataset`.
+    /// Saves a shard in the directory `here`, in which a source is unpacked. Errors: `Io`, `Dataset`.
     pub(super) fn save(
         &self,
         info: &DatasetInfo,
         shard: usize,
         made: EncodedShard,
-        (here, there): (&Path, &Path),
+        here: &Path,
     ) -> Result<(), ImportError> {
         unfinished::save(info, here, shard, 0, &made.encoded)?;
         let saved = SavedShard {
             plan: self.plan.clone(),
-            bad: made.bad.moved(here, there),
+            bad: made
+                .bad
+                .moved(here, Path::new(UNPACKED))
+                .moved(&self.places[1], Path::new(SOURCE)),
         };
         let text = serde_json::to_vec(&saved).expect("a list of texts that JSON cannot hold is a bug");
         Ok(write_atomically(&path(here, shard), &text)?)

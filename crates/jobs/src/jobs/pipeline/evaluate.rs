@@ -91,7 +91,7 @@ impl Pipeline {
         &self,
         part: &EvaluationPart,
         retry: &RetryPolicy<'_>,
-        compute: impl FnOnce(OnProgress) -> Result<(), EvaluationError>,
+        compute: impl Fn(OnProgress) -> Result<(), EvaluationError>,
     ) -> Result<JobResult, JobFailure> {
         let report = retry.report;
         self.prepare_part(report, retry)?;
@@ -101,7 +101,8 @@ impl Pipeline {
             // Whole passes are saved; a new attempt continues after them.
             report.checkpoint(saved_files(&part.dir));
         };
-        compute(&on_progress).map_err(|error| failed(&error))?;
+        // Passes that are saved are read again, so a full disk costs one pass.
+        retry.repeat(|| compute(&on_progress))?;
         self.finish_part((part.index, part.count), report, retry)
     }
 
