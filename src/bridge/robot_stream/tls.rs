@@ -68,6 +68,10 @@ fn reason(error: &std::io::Error) -> String {
         Some(Error::InvalidCertificate(CertificateError::UnknownIssuer)) => {
             "its certificate is not trusted; name the one to trust with --ca-certificate FILE".to_owned()
         }
+        // Such as one with the name of a certificate that the system trusts, but not signed by it.
+        Some(Error::InvalidCertificate(_)) => {
+            format!("{error}; name another certificate to trust with --ca-certificate FILE")
+        }
         _ => error.to_string(),
     }
 }
