@@ -16,6 +16,8 @@ use foreframe_data::dataset::{self, CollectConfig, CollectionStatus, DatasetErro
 
 /// The file of a part that is copied last to the object store.
 const LAST_FILE: &str = "collect.json";
+/// Its path in the directory of the part.
+const LAST_PATH: &str = "meta/collect.json";
 
 impl Pipeline {
     pub(super) fn collect(
@@ -90,7 +92,7 @@ impl Pipeline {
             return Ok(());
         }
         report.progress(0, config.trials, "joining the parts");
-        let dirs = self.fetch_parts(parts, LAST_FILE, retry)?;
+        let dirs = self.fetch_parts(parts, LAST_PATH, retry)?;
         retry.repeat_once_free(|| dataset::take_parts(config, &dirs))
     }
 }

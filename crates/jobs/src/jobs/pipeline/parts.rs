@@ -77,7 +77,7 @@ impl Pipeline {
     }
 
     /// Copies what the parts saved from the object store; returns their directories. If `last` differs from the local copy of
-    /// it, all local files are of another attempt, and deleted.
+    /// it, all local files are of another attempt, and deleted. `last` is a path in a part's directory.
     pub(super) fn fetch_parts(
         &self,
         parts: &[JobRow],
@@ -86,7 +86,8 @@ impl Pipeline {
     ) -> Result<Vec<PathBuf>, JobFailure> {
         let objects = self.store.objects();
         for part in parts {
-            retry.run(async || objects.pull_same(&run_key(part.id), last, last).await)?;
+            let name = last.rsplit('/').next().unwrap_or(last);
+            retry.run(async || objects.pull_same(&run_key(part.id), last, name).await)?;
         }
         let dir = |part: &JobRow| objects.data_dir().join(run_key(part.id));
         Ok(parts.iter().map(dir).collect())
