@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use foreframe::server::ServerConfig;
+use foreframe::server::{App, ServerConfig};
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
@@ -39,6 +39,16 @@ fn files(dir: &Path) -> BTreeMap<String, Vec<u8>> {
     found
 }
 
+/// A job of a server in this process, when it has succeeded.
+async fn succeeded(app: &App, id: &str) -> Value {
+    poll_until(async || {
+        let job = get(app, &format!("/v1/jobs/{id}")).await.json();
+        assert_ne!(job["state"], "failed", "{job}");
+        (job["state"] == "succeeded").then_some(job)
+    })
+    .await
+}
+
 #[tokio::test]
 async fn a_collection_in_parts_has_the_same_bytes() {
     let dir = tempfile::tempdir().unwrap();
@@ -48,12 +58,7 @@ async fn a_collection_in_parts_has_the_same_bytes() {
     // There are no more parts than shards.
     let parts = post(&app, "/v1/jobs", &collect("parts", 9)).await.json();
     assert_eq!(parts["parts"]["total"], 2);
-    let job = poll_until(async || {
-        let job = get(&app, "/v1/jobs/job-2").await.json();
-        assert_ne!(job["state"], "failed", "{job}");
-        (job["state"] == "succeeded").then_some(job)
-    })
-    .await;
+    let job = succeeded(&app, "job-2").await;
     assert_eq!(
         (&job["result"]["episodes"], &job["parts"]["done"]),
         (&json!(52), &json!(2))
@@ -146,6 +151,8 @@ fn a_killed_worker_leaves_its_part_to_another() {
     let job = wait_for(&address, "job-1", "succeeded");
     assert_eq!(job["parts"], json!({"total": 2, "done": 2, "running": 0, "failed": 0}));
     assert_eq!(ask(&address, "GET /v1/jobs/job-2", &Value::Null)["attempts"], 2);
+    let log = ask(&address, "GET /v1/jobs/job-1/logs", &Value::Null).to_string();
+    assert!(!log.contains("done again"), "{log}");
     let made = files(&machines.objects().join("datasets/seen"));
     assert!(made == files(&alone.path().join("datasets/seen")));
 }
@@ -234,12 +241,7 @@ async fn an_import_in_parts_has_the_same_bytes() {
     // There are two shards, so one part has nothing to do.
     let parts = post(&app, "/v1/jobs", &import("parts", 3)).await.json();
     assert_eq!(parts["parts"]["total"], 3, "{parts}");
-    let job = poll_until(async || {
-        let job = get(&app, "/v1/jobs/job-2").await.json();
-        assert_ne!(job["state"], "failed", "{job}");
-        (job["state"] == "succeeded").then_some(job)
-    })
-    .await;
+    let job = succeeded(&app, "job-2").await;
     assert_eq!(
         (&job["result"]["frames"], &job["parts"]["done"]),
         (&json!(2050), &json!(3))

@@ -79,21 +79,12 @@ pub fn run(
     on_progress: &(dyn Fn(EvaluationProgress) + Sync),
 ) -> Result<EvaluationReport, EvaluationError> {
     let started = Instant::now();
+    let held_out = HeldOut::of(loaded, dataset, config)?;
     let HeldOut {
-        config,
-        split_seed,
-        splits,
-        tests,
-    } = &HeldOut::of(loaded, dataset, config)?;
-    let inference = Inference { loaded, dataset };
-    let division = Division::joined(division::inputs(inference, config, *split_seed), &config.saved);
-    let mut evaluation = EvaluationContext {
-        inference,
-        split: Split::Test,
-        config,
-        division: &division,
-        on_progress,
-    };
+        config, splits, tests, ..
+    } = &held_out;
+    let division = Division::joined(held_out.inputs(loaded, dataset), &config.saved);
+    let mut evaluation = held_out.context(Inference { loaded, dataset }, &division, on_progress);
     let baselines = fitted_baselines(&evaluation, splits)?;
     let (mut sets, mut own_novelty) = (Vec::new(), Vec::new());
     for &split in *tests {
@@ -125,7 +116,7 @@ pub fn run(
     };
     Ok(EvaluationReport {
         novelty: config.novel.iter().map(compare).collect::<Result<_, _>>()?,
-        stamp: ReportStamp::new(&evaluation, *split_seed, started.elapsed()),
+        stamp: ReportStamp::new(&evaluation, held_out.split_seed, started.elapsed()),
         model: ModelSummary::of(loaded),
         nearest_windows: baselines.nearest_summary(),
         sets,
@@ -144,25 +135,13 @@ pub fn run_part(
     part: &EvaluationPart,
     on_progress: &(dyn Fn(EvaluationProgress) + Sync),
 ) -> Result<(), EvaluationError> {
-    let HeldOut {
-        config,
-        split_seed,
-        splits,
-        tests,
-    } = &HeldOut::of(loaded, dataset, config)?;
-    let inference = Inference { loaded, dataset };
-    let division = Division::of_part(division::inputs(inference, config, *split_seed), part);
-    let mut evaluation = EvaluationContext {
-        inference,
-        split: Split::Test,
-        config,
-        division: &division,
-        on_progress,
-    };
-    let baselines = fitted_baselines(&evaluation, splits)?;
-    for &split in *tests {
+    let held_out = HeldOut::of(loaded, dataset, config)?;
+    let division = Division::of_part(held_out.inputs(loaded, dataset), part);
+    let mut evaluation = held_out.context(Inference { loaded, dataset }, &division, on_progress);
+    let baselines = fitted_baselines(&evaluation, &held_out.splits)?;
+    for &split in held_out.tests {
         evaluation.split = split;
-        let available = available_windows(&evaluation, splits)?;
+        let available = available_windows(&evaluation, &held_out.splits)?;
         if why_skipped(dataset, split, &available).is_none() {
             Measurements::of(&evaluation, &evenly(&available, config.max_windows), &baselines)?;
         }
@@ -214,6 +193,27 @@ impl<'a> HeldOut<'a> {
             splits,
             tests,
         })
+    }
+
+    /// The hash of all that decides what is measured.
+    fn inputs(&self, loaded: &Model, dataset: &Dataset) -> String {
+        division::inputs(Inference { loaded, dataset }, &self.config, self.split_seed)
+    }
+
+    /// What the passes need; the split is set for each set.
+    fn context<'b>(
+        &'b self,
+        inference: Inference<'b>,
+        division: &'b Division<'b>,
+        on_progress: &'b (dyn Fn(EvaluationProgress) + Sync),
+    ) -> EvaluationContext<'b> {
+        EvaluationContext {
+            inference,
+            split: Split::Test,
+            config: &self.config,
+            division,
+            on_progress,
+        }
     }
 }
 

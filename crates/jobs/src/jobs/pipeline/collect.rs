@@ -15,9 +15,7 @@ use crate::store::JobRow;
 use foreframe_data::dataset::{self, CollectConfig, CollectionStatus, DatasetError};
 
 /// The file of a part that is copied last to the object store.
-const LAST_FILE: &str = "collect.json";
-/// Its path in the directory of the part.
-const LAST_PATH: &str = "meta/collect.json";
+const LAST_FILE: &str = "meta/collect.json";
 
 impl Pipeline {
     pub(super) fn collect(
@@ -92,7 +90,7 @@ impl Pipeline {
             return Ok(());
         }
         report.progress(0, config.trials, "joining the parts");
-        let dirs = self.fetch_parts(parts, LAST_PATH, retry)?;
+        let dirs = self.fetch_parts(parts, LAST_FILE, retry)?;
         retry.repeat_once_free(|| dataset::take_parts(config, &dirs))
     }
 }

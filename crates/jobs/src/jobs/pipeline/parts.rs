@@ -59,7 +59,8 @@ impl Pipeline {
         Ok(JobResult::of(json!({"part": index, "parts": count})))
     }
 
-    /// Copies what a part saved to the object store, if there is a shared one; the file `last` marks it as complete.
+    /// Copies what a part saved to the object store, if there is a shared one. The file `last`, a path in the part's directory, marks
+    /// it as complete.
     pub(super) fn push_part(
         &self,
         last: &str,
@@ -67,7 +68,7 @@ impl Pipeline {
         retry: &RetryPolicy<'_>,
     ) -> Result<(), JobFailure> {
         let (run, objects) = (run_key(report.id()), self.store.objects());
-        retry.run(async || objects.push(&run, last).await)?;
+        retry.run(async || objects.push(&run, name(last)).await)?;
         if objects.are_shared()
             && let Err(error) = fs::remove_dir_all(objects.data_dir().join(&run))
         {
@@ -86,8 +87,14 @@ impl Pipeline {
     ) -> Result<Vec<PathBuf>, JobFailure> {
         let objects = self.store.objects();
         for part in parts {
-            let name = last.rsplit('/').next().unwrap_or(last);
-            retry.run(async || objects.pull_same(&run_key(part.id), last, name).await)?;
+            let is_there = retry.run(async || objects.pull_same(&run_key(part.id), last, name(last)).await)?;
+            if objects.are_shared() && !is_there {
+                let line = format!(
+                    "nothing of its part {} is in the object store, so it is done again",
+                    part.id
+                );
+                retry.report.line(line);
+            }
         }
         let dir = |part: &JobRow| objects.data_dir().join(run_key(part.id));
         Ok(parts.iter().map(dir).collect())
@@ -100,4 +107,9 @@ impl Pipeline {
         }
         Ok(())
     }
+}
+
+/// The last component of a path in the object store.
+fn name(path: &str) -> &str {
+    path.rsplit('/').next().unwrap_or(path)
 }
