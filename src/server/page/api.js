@@ -99,8 +99,9 @@ export async function all(path, name, limit = 1000) {
 const FIRST_WAIT_MS = 250;
 const LONGEST_WAIT_MS = 4000;
 
-// Listens to server-sent events, and connects again when the connection is lost. `on(name, data)` gets every event,
-// "open", "lost", and "refused" with the reason if there is nothing to listen to; it returns true after the last event that it wants. EventSource cannot send the key.
+// Listens to server-sent events, and connects again when the connection is lost. EventSource cannot send the key. `on(name, data)` gets
+// every event, "open", "lost", and "refused" with the reason if there is nothing to listen to; it returns true after the last event that
+// it wants.
 export function listen(path, on) {
   const stop = new AbortController();
   follow(path, on, stop.signal).catch(() => {});
