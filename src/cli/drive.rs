@@ -16,7 +16,7 @@ use foreframe_train::evaluation::drive::{self, DriveScore, DriveSettings, Driver
 ///
 /// The drivers: pid drives straight to the goal and sees nothing; stop does the same, but stands while the model sees something on
 /// its way; plan follows the plan that the model finds, anew at every frame; velocity does the same, but expects movers to go on as
-/// fast as in the last frames; simulator plans with the simulator itself as the model, the upper limit. Goals can be reached on a
+/// fast as in the last frames; places also knows where all robots are, seen or not; simulator plans with the simulator itself as the model, the upper limit. Goals can be reached on a
 /// straight line, but for the other robots. All drivers know where the goal is. The table has means over the episodes with 95 %
 /// bootstrap intervals.
 #[derive(clap::Args)]
@@ -36,16 +36,16 @@ pub(super) struct DriveArgs {
     /// The same seed gives the same episodes and goals
     #[arg(long, default_value_t = 0)]
     seed: u64,
-    /// The drivers: pid, stop, velocity, plan, simulator
+    /// The drivers: pid, stop, velocity, places, plan, simulator
     #[arg(long = "driver", value_delimiter = ',', required = true)]
     drivers: Vec<DriverKind>,
-    /// For the drivers stop, velocity and plan: the directory of a model, its name, or NAME@VERSION
+    /// For the drivers stop, velocity, places and plan: the directory of a model, its name, or NAME@VERSION
     #[arg(long)]
     model: Option<String>,
     /// Longest time of an episode, in seconds
     #[arg(long, value_name = "S", default_value_t = 20.0)]
     duration: f64,
-    /// The time for each plan of the drivers velocity and plan, in milliseconds; without it, searches are whole, and a drive can be repeated
+    /// The time for each plan of the drivers velocity, places and plan, in milliseconds; without it, searches are whole, and a drive can be repeated
     #[arg(long, value_name = "MS", value_parser = clap::value_parser!(u64).range(1..=10_000))]
     budget_ms: Option<u64>,
     /// Print the scores and all episodes as JSON
@@ -72,22 +72,18 @@ pub(super) fn run(args: &DriveArgs) -> Result<(), CliError> {
         budget: args.budget_ms.map(Duration::from_millis),
     };
     let shows_progress = std::io::stderr().is_terminal();
-    let scores = drive::run(
-        model.as_ref().map(|(_, model)| model),
-        &settings,
-        &mut |driver, episode| {
-            if shows_progress {
-                // Progress that cannot be shown does not stop a drive.
-                let _ = write!(
-                    std::io::stderr(),
-                    "\r{}: {} of {}  ",
-                    driver.name(),
-                    episode + 1,
-                    args.episodes
-                );
-            }
-        },
-    );
+    let scores = drive::run(model.as_ref().map(|(_, model)| model), &settings, &|driver, episode| {
+        if shows_progress {
+            // Progress that cannot be shown does not stop a drive.
+            let _ = write!(
+                std::io::stderr(),
+                "\r{}: {} of {}  ",
+                driver.name(),
+                episode,
+                args.episodes
+            );
+        }
+    });
     if shows_progress {
         let _ = writeln!(std::io::stderr());
     }
@@ -99,25 +95,29 @@ pub(super) fn run(args: &DriveArgs) -> Result<(), CliError> {
         "driver",
         "success",
         "collisions",
+        "of them standing",
+        "unseen",
         "time s",
         "SPL",
         "closest m",
         "stops",
         "choice ms (p50, p95)",
     ];
-    let rows: Vec<[String; 8]> = scores.iter().map(row).collect();
+    let rows: Vec<[String; 10]> = scores.iter().map(row).collect();
     for line in aligned(header, &rows) {
         print_line(line)?;
     }
     Ok(())
 }
 
-fn row(scores: &DriverScores) -> [String; 8] {
+fn row(scores: &DriverScores) -> [String; 10] {
     let [median, late] = scores.planning_ms;
     [
         scores.driver.name().to_owned(),
         text(&scores.success),
         text(&scores.collisions),
+        format!("{:.2}", scores.while_standing.mean),
+        format!("{:.2}", scores.unseen.mean),
         text(&scores.time_s),
         text(&scores.spl),
         text(&scores.closest_m),

@@ -31,6 +31,7 @@ mod world;
 pub use config::{CameraConfig, Look, WorldConfig};
 pub use environment::Environment;
 pub use error::SimError;
+pub use physics::Touch;
 pub use robot::PlanarPose;
 pub use room_set::RoomSet;
 pub use route::{CrossingHabits, PidGains, Route};

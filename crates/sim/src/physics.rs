@@ -27,6 +27,16 @@ struct Body {
     drive: DifferentialDrive,
 }
 
+/// What a robot touches.
+#[derive(Clone, Copy, Debug, PartialEq)]
+#[doc(hidden)]
+pub struct Touch {
+    /// How fast its own wheels drive it, in m/s.
+    pub speed_m_s: f32,
+    /// The number of the other robot, which is its id in the segmentation mask; `None` if it is none.
+    pub robot: Option<usize>,
+}
+
 /// A room with its robots, in the order in which they were added.
 pub(super) struct PhysicsScene {
     physics: PhysicsWorld,
@@ -168,6 +178,22 @@ impl PhysicsScene {
     pub(super) fn is_touching(&self, robot: usize) -> bool {
         let mut contacts = self.physics.contact_pairs_with(self.robots[robot].collider);
         contacts.any(ContactPair::has_any_active_contact)
+    }
+
+    /// What the robot touches; the first of several, `None` if it touches nothing.
+    pub(super) fn touch(&self, robot: usize) -> Option<Touch> {
+        let own = &self.robots[robot];
+        let mut contacts = self.physics.contact_pairs_with(own.collider);
+        let contact = contacts.find(|pair| pair.has_any_active_contact())?;
+        let other = if contact.collider1 == own.collider {
+            contact.collider2
+        } else {
+            contact.collider1
+        };
+        Some(Touch {
+            speed_m_s: own.drive.velocity().0,
+            robot: self.robots.iter().position(|robot| robot.collider == other),
+        })
     }
 }
 

@@ -11,7 +11,7 @@ use super::config::{CameraConfig, WorldConfig};
 use super::driver::Driver;
 use super::error::SimError;
 use super::navigator::Navigator;
-use super::physics::PhysicsScene;
+use super::physics::{PhysicsScene, Touch};
 use super::rendered_robot::RenderedRobot;
 use super::robot::PlanarPose;
 use super::room::Room;
@@ -118,8 +118,8 @@ pub struct World {
     observation: Observation,
     policy_action: Action,
     ended: bool,
-    /// Whether Tb1 touched something in the last step.
-    touched: bool,
+    /// What Tb1 touched first in the last step.
+    touch: Option<Touch>,
 }
 
 /// What happens to Tb1 in a step that is only tried.
@@ -188,7 +188,7 @@ impl World {
             observation,
             policy_action: Action::try_from(vec![0.0, 0.0])?,
             ended: false,
-            touched: false,
+            touch: None,
         };
         world.update_observation()?;
         Ok(world)
@@ -232,17 +232,24 @@ impl World {
         (1..=self.others.len()).map(|robot| self.physics.pose(robot)).collect()
     }
 
+    /// The radius of one of the other robots, in the order of their poses, in metres.
+    #[must_use]
+    #[doc(hidden)]
+    pub fn other_robot_radius_m(&self, robot: usize) -> f32 {
+        self.physics.radius_m(robot + 1)
+    }
+
     /// True pose of Tb1.
     #[must_use]
     pub fn observer_pose(&self) -> PlanarPose {
         self.physics.pose(0)
     }
 
-    /// Whether Tb1 touched something in the last step.
+    /// What Tb1 touched first in the last step.
     #[must_use]
     #[doc(hidden)]
-    pub fn has_touched(&self) -> bool {
-        self.touched
+    pub fn touch(&self) -> Option<Touch> {
+        self.touch
     }
 
     /// The distance from Tb1's edge to the nearest wall, piece or robot, in metres.
@@ -284,11 +291,11 @@ impl World {
         let next_goals = self.parameters.scenario.has_several_goals().then_some(&self.room);
         let step = |&command: &[f32; 2]| {
             physics.command(0, command);
-            let touched = advance(&mut physics, &mut others, next_goals, self.config.frame_period_s as f32);
+            let touch = advance(&mut physics, &mut others, next_goals, self.config.frame_period_s as f32);
             TriedStep {
                 pose: physics.pose(0),
                 gap_m: gap_m(&physics, &self.room),
-                touched,
+                touched: touch.is_some(),
             }
         };
         commands.iter().map(step).collect()
@@ -330,13 +337,12 @@ impl World {
             self.physics.command(0, [linear, angular]);
         }
         let next_goals = self.parameters.scenario.has_several_goals().then_some(&self.room);
-        let touched = advance(
+        self.touch = advance(
             &mut self.physics,
             &mut self.others,
             next_goals,
             self.config.frame_period_s as f32,
         );
-        self.touched = touched;
         self.frame_index += 1;
         self.update_observation()?;
         let tb2_arrived = self.others[0].navigator.has_arrived(self.physics.pose(1));
@@ -345,7 +351,7 @@ impl World {
         self.ended = terminated || truncated;
         Ok(StepResult {
             observation: self.observe(),
-            reward: self.view_score() - if touched { 1.0 } else { 0.0 },
+            reward: self.view_score() - if self.touch.is_some() { 1.0 } else { 0.0 },
             terminated,
             truncated,
         })
@@ -388,19 +394,24 @@ impl World {
     }
 }
 
-/// Simulates the physics for one frame period; returns true if Tb1 touched something.
-fn advance(physics: &mut PhysicsScene, others: &mut [OtherRobot], next_goals: Option<&Room>, period_s: f32) -> bool {
+/// Simulates the physics for one frame period; returns what Tb1 touched first.
+fn advance(
+    physics: &mut PhysicsScene,
+    others: &mut [OtherRobot],
+    next_goals: Option<&Room>,
+    period_s: f32,
+) -> Option<Touch> {
     let steps = (period_s / PHYSICS_STEP_S).ceil().max(1.0);
     let dt = period_s / steps;
-    let mut touched = false;
+    let mut touch = None;
     for _ in 0..steps as usize {
         for (other, robot) in others.iter_mut().zip(1..) {
             other.control(physics, robot, next_goals, dt);
         }
         physics.advance(dt);
-        touched |= physics.is_touching(0);
+        touch = touch.or_else(|| physics.touch(0));
     }
-    touched
+    touch
 }
 
 fn gap_m(physics: &PhysicsScene, room: &Room) -> f32 {

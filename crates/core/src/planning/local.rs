@@ -201,6 +201,19 @@ mod tests {
     }
 
     #[test]
+    fn without_finalists_only_stopping_is_predicted() {
+        let model = test_speed_model();
+        let mut fast = input(SolverKind::Cem);
+        fast.settings.finalists = 0;
+        fast.present = vec![action(0.2, 0.1)];
+        let choice = plan(&model, &context(&model), fast).unwrap();
+        assert_eq!((choice.predicted, choice.samples), (1, 64 * 4 + 2));
+        assert_eq!((choice.best.kind, choice.unsafe_reason), (CandidateKind::Drawn, None));
+        assert!(choice.best.rollout.is_none() && choice.best.motion.is_some());
+        assert!(choice.best.actions.iter().all(|action| action.as_slice()[0] > 0.3));
+    }
+
+    #[test]
     fn stopping_is_standing_whatever_the_limits() {
         let model = test_speed_model();
         let mut hurried = input(SolverKind::Cem);

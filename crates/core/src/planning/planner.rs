@@ -30,7 +30,7 @@ pub struct PlanBatch {
 }
 
 enum Phase {
-    /// Stopping and the present plan are predicted, and what stands in the way is looked at.
+    /// Stopping is predicted, with finalists also the present plan, and what stands in the way is looked at.
     First,
     Search,
     /// The best plans are predicted.
@@ -106,9 +106,13 @@ impl Planner {
     /// Errors: `Motion`.
     pub fn next_batch(&mut self, elapsed: &dyn Fn() -> Duration) -> Result<Option<PlanBatch>, PlanError> {
         if matches!(self.phase, Phase::First) {
-            let waiting = std::mem::take(&mut self.waiting);
+            let mut first = std::mem::take(&mut self.waiting);
+            if self.judge.input.settings.finalists == 0 && !self.judge.needs_frames() {
+                // The present plan is judged by its way, as all others.
+                self.waiting = first.split_off(1);
+            }
             self.phase = Phase::Search;
-            return Ok(Some(self.ask(waiting, true)));
+            return Ok(Some(self.ask(first, true)));
         }
         while matches!(self.phase, Phase::Search) {
             if let Some(batch) = self.search(elapsed)? {
@@ -296,6 +300,6 @@ impl Planner {
         let mut like = like.into_iter();
         self.drawn.retain(|_| !like.next().unwrap_or(false));
         self.drawn.insert(place, tried);
-        self.drawn.truncate(self.judge.input.settings.finalists);
+        self.drawn.truncate(self.judge.input.settings.finalists.max(1));
     }
 }

@@ -94,7 +94,8 @@ pub struct PlanSettings {
     pub steps: Option<usize>,
     /// The time for all of it; the best plan so far is the answer.
     pub budget: Option<Duration>,
-    /// How many of the best plans are predicted and compared at the end.
+    /// How many of the best plans are predicted and compared at the end; with 0, only stopping is predicted, which tells what stands
+    /// around the robot.
     pub finalists: usize,
     /// Radius of the robot's round footprint, in metres.
     pub radius_m: f32,
@@ -131,7 +132,7 @@ impl PlanSettings {
             ("solver.noise_color", f64::from(solver.noise_color), [0.0, 8.0]),
             ("solver.temperature", f64::from(solver.temperature), [1e-3, 100.0]),
             ("budget_ms", budget, [1.0, 10_000.0]),
-            ("finalists", self.finalists as f64, [1.0, 64.0]),
+            ("finalists", self.finalists as f64, [0.0, 64.0]),
             ("radius_m", f64::from(self.radius_m), [0.0, 5.0]),
             ("margin_m", f64::from(self.margin_m), [0.0, 5.0]),
             ("robot_height_m", f64::from(self.robot_height_m), [0.15, 5.0]),

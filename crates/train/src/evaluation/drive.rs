@@ -12,29 +12,37 @@ mod simulated;
 mod situation;
 mod tracks;
 
+use std::sync::atomic::{AtomicUsize, Ordering};
+
 use foreframe_core::registry::Model;
+use rayon::prelude::*;
 
 pub use self::episode::EpisodeResult;
 pub use self::error::DriveError;
 pub use self::scores::{DriveScore, DriverScores};
 pub use self::settings::{DriveSettings, DriverKind};
 
-/// Drives every episode with every driver. `model`: needed by those that see or plan with one. `on_episode` is called after each
-/// episode of a driver. Errors: a driver without the model that it needs, a scenario in which Tb1 does not drive, those of the simulator
+/// Drives every episode with every driver, side by side on all cores. `model`: needed by those that see or plan with one.
+/// `on_episode` is called after each episode of a driver, with how many are over. Errors: a driver without the model that it needs, a scenario in which Tb1 does not drive, those of the simulator
 /// and of the predictions.
 pub fn run(
     model: Option<&Model>,
     settings: &DriveSettings,
-    on_episode: &mut dyn FnMut(DriverKind, usize),
+    on_episode: &(dyn Fn(DriverKind, usize) + Sync),
 ) -> Result<Vec<DriverScores>, DriveError> {
     settings.check(model)?;
     let mut scores = Vec::new();
     for &driver in &settings.drivers {
-        let mut results = Vec::new();
-        for episode in 0..settings.episodes {
-            results.push(episode::drive(driver, model, settings, episode)?);
-            on_episode(driver, episode);
-        }
+        let over = AtomicUsize::new(0);
+        let drive = |episode| {
+            let result = episode::drive(driver, model, settings, episode);
+            on_episode(driver, over.fetch_add(1, Ordering::Relaxed) + 1);
+            result
+        };
+        let results = (0..settings.episodes)
+            .into_par_iter()
+            .map(drive)
+            .collect::<Result<_, _>>()?;
         scores.push(DriverScores::new(driver, results, settings.seed));
     }
     Ok(scores)
@@ -59,7 +67,7 @@ mod tests {
 
     #[test]
     fn the_straight_driver_arrives_and_the_same_seed_gives_the_same_drive() {
-        let run = || run(None, &settings(&[DriverKind::Pid]), &mut |_, _| {}).unwrap();
+        let run = || run(None, &settings(&[DriverKind::Pid]), &|_, _| {}).unwrap();
         let scores = run();
         let results = &scores[0].episodes;
         assert!(results.iter().any(|result| result.arrived), "{results:?}");
@@ -76,7 +84,7 @@ mod tests {
         let mut settings = settings(&[DriverKind::Pid, DriverKind::Simulator]);
         settings.scenario = Scenario::Crowded;
         settings.duration_s = 12.0;
-        let scores = run(None, &settings, &mut |_, _| {}).unwrap();
+        let scores = run(None, &settings, &|_, _| {}).unwrap();
         let collisions = |scores: &DriverScores| scores.episodes.iter().map(|result| result.collisions).sum::<usize>();
         assert!(collisions(&scores[1]) <= collisions(&scores[0]), "{scores:?}");
         let shortest = |scores: &DriverScores| scores.episodes.iter().map(|r| r.shortest_m).collect::<Vec<_>>();
@@ -85,13 +93,13 @@ mod tests {
 
     #[test]
     fn a_driver_without_its_model_is_refused() {
-        let error = run(None, &settings(&[DriverKind::Plan]), &mut |_, _| {}).unwrap_err();
+        let error = run(None, &settings(&[DriverKind::Plan]), &|_, _| {}).unwrap_err();
         assert_eq!(error.to_string(), "driver plan needs a model; name one");
         let still = DriveSettings {
             scenario: Scenario::StaticObserver,
             ..settings(&[DriverKind::Pid])
         };
-        let error = run(None, &still, &mut |_, _| {}).unwrap_err();
+        let error = run(None, &still, &|_, _| {}).unwrap_err();
         assert!(error.to_string().contains("static-observer"), "{error}");
     }
 }

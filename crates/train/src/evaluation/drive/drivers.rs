@@ -60,7 +60,7 @@ impl<'a> EpisodeDriver<'a> {
     pub(super) fn command(&mut self, now: &Situation<'_>) -> Result<[f32; 2], DriveError> {
         match (self.kind, self.model) {
             (DriverKind::Stop, Some(model)) => self.stop_and_go(model, now),
-            (DriverKind::Plan | DriverKind::Velocity, Some(model)) => self.planned(model, now),
+            (DriverKind::Plan | DriverKind::Velocity | DriverKind::Places, Some(model)) => self.planned(model, now),
             (DriverKind::Simulator, _) => self.simulated(now),
             _ => Ok(self.straight(now)),
         }
@@ -114,6 +114,7 @@ impl<'a> EpisodeDriver<'a> {
                 },
                 limits: Some(LIMITS.to_vec()),
                 budget: self.budget,
+                finalists: 0,
                 radius_m: RADIUS_M,
                 margin_m: MARGIN_M,
                 ..PlanSettings::default()
@@ -124,11 +125,11 @@ impl<'a> EpisodeDriver<'a> {
             before: None,
         };
         let (tracks, pose) = (&mut self.tracks, now.world.observer_pose());
-        let is_extrapolated = self.kind == DriverKind::Velocity;
-        let choice = plan_around(model, &now.context(model)?, input, &mut |occupancy| {
-            if is_extrapolated {
-                tracks.extrapolate(&mut occupancy.movers, pose);
-            }
+        let kind = self.kind;
+        let choice = plan_around(model, &now.context(model)?, input, &mut |occupancy| match kind {
+            DriverKind::Velocity => tracks.extrapolate(&mut occupancy.movers, pose),
+            DriverKind::Places => tracks.extrapolate_true(&mut occupancy.movers, now.world),
+            _ => {}
         })?;
         let mut actions = choice.best.actions.into_iter();
         let first = actions.next().map_or_else(Vec::new, Vec::from);

@@ -1,6 +1,6 @@
 //! One episode with one driver.
 
-use std::collections::VecDeque;
+use std::collections::{BTreeMap, VecDeque};
 use std::f32::consts::PI;
 use std::time::Instant;
 
@@ -23,6 +23,9 @@ const LEAST_GOAL_M: f32 = 1.5;
 const CROSSED_RAD: f32 = 0.35;
 /// Without a model, the robot stands for this many frames, as others stand until their model's context is full.
 const CONTEXT: usize = 5;
+/// A robot counts as seen for so long after the camera showed that many of its pixels, in seconds.
+const SEEN_S: f32 = 2.0;
+const SEEN_PIXELS: usize = 6;
 /// Commands below this are standing, in m/s.
 const STANDING_M_S: f32 = 0.02;
 
@@ -33,6 +36,10 @@ pub struct EpisodeResult {
     pub arrived: bool,
     /// How often it began to touch something.
     pub collisions: usize,
+    /// Of these, those in which its wheels stood: something drove into it.
+    pub while_standing: usize,
+    /// Of these, those with a robot that the camera had not shown in the two seconds before.
+    pub unseen: usize,
     /// The time until it arrived, or all of it, in seconds.
     pub time_s: f64,
     /// The way that it drove, in metres.
@@ -126,6 +133,8 @@ pub(super) fn drive(
     let mut result = EpisodeResult {
         arrived: false,
         collisions: 0,
+        while_standing: 0,
+        unseen: 0,
         time_s: 0.0,
         way_m: 0.0,
         shortest_m: f64::from(start),
@@ -134,9 +143,14 @@ pub(super) fn drive(
         planning_ms: PlanningTimes::default(),
     };
     let (mut frames, mut states) = (VecDeque::new(), VecDeque::new());
+    let mut views = RobotViews {
+        recent: (SEEN_S / period_s).round() as u64,
+        last: BTreeMap::new(),
+    };
     let (mut was_touching, mut was_moving) = (false, false);
     for frame in 0.. {
         let observation = world.observe();
+        views.record(&observation.mask, frame);
         frames.push_back(observation.frame);
         states.push_back(observation.state);
         if frames.len() > context {
@@ -165,8 +179,13 @@ pub(super) fn drive(
         let after = world.observer_pose();
         result.way_m += f64::from((after.x_m - before.x_m).hypot(after.y_m - before.y_m));
         result.closest_m = result.closest_m.min(f64::from(world.gap_m()));
-        result.collisions += usize::from(world.has_touched() && !was_touching);
-        was_touching = world.has_touched();
+        let touch = world.touch();
+        if let Some(touch) = touch.filter(|_| !was_touching) {
+            result.collisions += 1;
+            result.while_standing += usize::from(touch.speed_m_s < STANDING_M_S);
+            result.unseen += usize::from(touch.robot.is_some_and(|robot| !views.saw(robot, frame)));
+        }
+        was_touching = touch.is_some();
         result.time_s = step.observation.time_s;
         result.arrived = distance(&world, goal) < ARRIVAL_M;
         if result.arrived || step.truncated || step.terminated {
@@ -174,6 +193,30 @@ pub(super) fn drive(
         }
     }
     Ok(result)
+}
+
+/// When the camera showed each of the other robots last.
+struct RobotViews {
+    /// Frames that count as just now.
+    recent: u64,
+    last: BTreeMap<u8, u64>,
+}
+
+impl RobotViews {
+    /// `mask`: the robot of each pixel.
+    fn record(&mut self, mask: &[u8], frame: u64) {
+        let mut pixels = BTreeMap::new();
+        for &robot in mask.iter().filter(|&&robot| robot > 0) {
+            *pixels.entry(robot).or_insert(0) += 1;
+        }
+        let shown = pixels.into_iter().filter(|&(_, count)| count >= SEEN_PIXELS);
+        self.last.extend(shown.map(|(robot, _)| (robot, frame)));
+    }
+
+    fn saw(&self, robot: usize, frame: u64) -> bool {
+        let last = u8::try_from(robot).ok().and_then(|robot| self.last.get(&robot));
+        last.is_some_and(|&last| frame - last <= self.recent)
+    }
 }
 
 fn distance(world: &World, [x, y]: [f32; 2]) -> f32 {

@@ -30,6 +30,10 @@ pub struct DriverScores {
     pub arrived: DriveScore,
     /// Collisions of an episode.
     pub collisions: DriveScore,
+    /// Of these, those in which the robot stood and something drove into it.
+    pub while_standing: DriveScore,
+    /// Of these, those with a robot that the camera had not shown in the two seconds before.
+    pub unseen: DriveScore,
     /// Time of an episode, in seconds; all of it if the robot did not arrive.
     pub time_s: DriveScore,
     /// Success, weighted by the straight way over the way driven (Anderson et al. 2018).
@@ -56,6 +60,8 @@ impl DriverScores {
                 success * result.shortest_m / result.way_m.max(result.shortest_m),
                 result.closest_m,
                 result.stops as f64,
+                result.while_standing as f64,
+                result.unseen as f64,
             ]
         };
         let own: Vec<usize> = (0..episodes.len()).collect();
@@ -83,6 +89,8 @@ impl DriverScores {
             success: score(0),
             arrived: score(1),
             collisions: score(2),
+            while_standing: score(7),
+            unseen: score(8),
             time_s: score(3),
             spl: score(4),
             closest_m: score(5),
@@ -103,6 +111,8 @@ mod tests {
         let result = |arrived, collisions| EpisodeResult {
             arrived,
             collisions,
+            while_standing: 0,
+            unseen: 0,
             time_s: 4.0,
             way_m: 4.0,
             shortest_m: 2.0,

@@ -20,6 +20,8 @@ pub enum DriverKind {
     Stop,
     /// As `plan`, but movers are expected to go on as fast as in the last frames, instead of as the model predicts.
     Velocity,
+    /// As `velocity`, but knows where every robot is now, also those that the camera does not show.
+    Places,
     /// Follows the plan that the model finds, and plans anew at every frame.
     Plan,
     /// Plans with the simulator itself as the model: it knows where everything will be. The upper limit.
@@ -28,7 +30,14 @@ pub enum DriverKind {
 
 impl DriverKind {
     /// All drivers.
-    pub const ALL: [Self; 5] = [Self::Pid, Self::Stop, Self::Velocity, Self::Plan, Self::Simulator];
+    pub const ALL: [Self; 6] = [
+        Self::Pid,
+        Self::Stop,
+        Self::Velocity,
+        Self::Places,
+        Self::Plan,
+        Self::Simulator,
+    ];
 
     /// Its name.
     #[must_use]
@@ -37,6 +46,7 @@ impl DriverKind {
             Self::Pid => "pid",
             Self::Stop => "stop",
             Self::Velocity => "velocity",
+            Self::Places => "places",
             Self::Plan => "plan",
             Self::Simulator => "simulator",
         }
@@ -48,7 +58,9 @@ impl FromStr for DriverKind {
 
     fn from_str(name: &str) -> Result<Self, String> {
         let found = Self::ALL.into_iter().find(|driver| driver.name() == name);
-        found.ok_or_else(|| format!("there is no driver {name:?}; there are: pid, stop, velocity, plan, simulator"))
+        found.ok_or_else(|| {
+            format!("there is no driver {name:?}; there are: pid, stop, velocity, places, plan, simulator")
+        })
     }
 }
 
@@ -97,7 +109,7 @@ impl DriveSettings {
             return Err(DriveError::NoDriver);
         }
         for &driver in &self.drivers {
-            if !matches!(driver, DriverKind::Stop | DriverKind::Velocity | DriverKind::Plan) {
+            if matches!(driver, DriverKind::Pid | DriverKind::Simulator) {
                 continue;
             }
             let Some(model) = model else {
@@ -115,7 +127,9 @@ impl DriveSettings {
             if !fits {
                 return Err(DriveError::OtherRobot { model: name() });
             }
-            if driver == DriverKind::Velocity && !spec.flow().is_some_and(|flow| flow.layers.movers) {
+            if matches!(driver, DriverKind::Velocity | DriverKind::Places)
+                && !spec.flow().is_some_and(|flow| flow.layers.movers)
+            {
                 return Err(DriveError::NoMovers {
                     driver: driver.name(),
                     model: name(),

@@ -1,11 +1,15 @@
 //! Where movers will be if each goes on as fast as in the last frames: what a planner can do without a network that predicts.
 
-use foreframe_sim::PlanarPose;
+use std::f32::consts::TAU;
+
+use foreframe_sim::{PlanarPose, World};
 
 /// Places of one mover are not farther apart than this, in metres.
 const APART_M: f32 = 0.25;
 /// A mover is not farther than this from where it was a frame ago, in metres.
 const LONGEST_STEP_M: f32 = 0.4;
+/// Places on the edge of a robot.
+const EDGE_PLACES: usize = 12;
 /// Frames over which a speed is measured.
 const FRAMES: usize = 4;
 
@@ -14,6 +18,8 @@ const FRAMES: usize = 4;
 pub(super) struct MoverTracks {
     /// Of each mover that is seen now: its middle in the last frames, in the room, oldest first.
     tracks: Vec<Vec<[f32; 2]>>,
+    /// The true places of all robots a frame ago.
+    places: Vec<[f32; 2]>,
 }
 
 impl MoverTracks {
@@ -50,6 +56,35 @@ impl MoverTracks {
             *places = moved.collect();
         }
         self.tracks = tracks;
+    }
+
+    /// The same for the true places of all robots. Their speeds are those of the last frame.
+    pub(super) fn extrapolate_true(&mut self, movers: &mut [Vec<[f32; 2]>], world: &World) {
+        let places: Vec<[f32; 2]> = world
+            .other_robot_poses()
+            .iter()
+            .map(|pose| [pose.x_m, pose.y_m])
+            .collect();
+        let pose = world.observer_pose();
+        let (sin, cos) = pose.heading_rad.sin_cos();
+        for (places_then, steps) in movers.iter_mut().zip(0u8..) {
+            let robots = places.iter().enumerate().flat_map(|(robot, &[x, y])| {
+                let [x_before, y_before] = self.places.get(robot).copied().unwrap_or([x, y]);
+                let steps = f32::from(steps);
+                let middle = [x + steps * (x - x_before), y + steps * (y - y_before)];
+                let radius = world.other_robot_radius_m(robot);
+                (0..EDGE_PLACES).map(move |nth| {
+                    let (sin, cos) = (TAU * nth as f32 / EDGE_PLACES as f32).sin_cos();
+                    [middle[0] + radius * cos, middle[1] + radius * sin]
+                })
+            });
+            let seen = robots.map(|[x, y]| {
+                let (x, y) = (x - pose.x_m, y - pose.y_m);
+                [cos * x + sin * y, cos * y - sin * x]
+            });
+            *places_then = seen.collect();
+        }
+        self.places = places;
     }
 }
 
