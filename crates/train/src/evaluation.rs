@@ -25,6 +25,7 @@ mod novelty_scale;
 mod output;
 pub mod plans;
 mod progress;
+pub mod ranking;
 mod replay;
 pub mod report;
 mod score;

@@ -20,6 +20,8 @@ pub(super) enum ActionSource<'a> {
     Recorded,
     /// For each window, in the order of the batch, those carried out in another one.
     OfWindows(&'a [Window]),
+    /// These: of each window, in the order of the batch, step after step, in the channels' own units.
+    Given(&'a [f32]),
     /// At every step the action that led to the last frame seen.
     Held,
     /// Zero in every component, in the channels' own units.
@@ -180,7 +182,11 @@ impl<'a> Inference<'a> {
                 ActionSource::OfWindows(others) => others,
                 _ => windows,
             };
-            for window in acting {
+            if let ActionSource::Given(given) = source {
+                actions.extend_from_slice(given);
+            }
+            let is_given = matches!(source, ActionSource::Given(_));
+            for window in acting.iter().filter(|_| !is_given) {
                 for step in 0..spec.horizon {
                     let place = match source {
                         ActionSource::Held => last.saturating_sub(1),

@@ -8,6 +8,7 @@ use super::forecast::{Forecast, forecasts};
 use super::metrics::{WindowScores, add_benchmark};
 use super::plans;
 use super::progress::EvaluationContext;
+use super::ranking;
 use super::report::SetScores;
 use super::score::score;
 use super::surroundings::{self, SurroundingsMeasurements};
@@ -28,6 +29,8 @@ struct ActionMeasurements {
     errors: Vec<VariantErrors>,
     /// The share of the plans that each context identifies.
     plans: Vec<Option<f64>>,
+    /// Of each moment of a recording, how many plans are as good as the driven one.
+    ranking: Vec<Vec<usize>>,
 }
 
 impl Measurements {
@@ -42,6 +45,7 @@ impl Measurements {
             Ok::<_, EvaluationError>(ActionMeasurements {
                 errors: actions::compare(evaluation, windows)?,
                 plans: plans::identify(evaluation, windows)?,
+                ranking: ranking::rank(evaluation, windows)?,
             })
         };
         let calibration = loaded.manifest.calibration.as_ref();
@@ -72,6 +76,7 @@ impl Measurements {
             let group_of: Vec<usize> = self.scores.iter().map(|window| window.group).collect();
             scores.actions = Some(actions::table(&found.errors, &group_of, &bootstrap));
             scores.plans = Some(plans::outcome(evaluation, windows, &found.plans));
+            scores.ranking = ranking::rates(evaluation, windows, &group_of, &found.ranking, &bootstrap);
         }
         scores.surroundings = self.surroundings.map(SurroundingsMeasurements::scores);
         let mut novelty = Vec::new();

@@ -21,6 +21,8 @@ pub enum EvaluationStage {
     Actions,
     /// Plan identification.
     Plans,
+    /// Which plan would be chosen.
+    Ranking,
     /// Where movers are.
     Surroundings,
     /// How far away things are.
@@ -37,6 +39,7 @@ impl EvaluationStage {
             Self::Scores => "scores",
             Self::Actions => "actions",
             Self::Plans => "plans",
+            Self::Ranking => "ranking",
             Self::Surroundings => "surroundings",
             Self::Depth => "depth",
             Self::Calibration => "calibration",

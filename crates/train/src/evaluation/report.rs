@@ -12,6 +12,7 @@ use super::method::Method;
 use super::metrics::{MethodScores, StepCurve, WindowScores, summarize};
 use super::plans::PlanOutcome;
 use super::progress::EvaluationContext;
+use super::ranking::PlanRanking;
 use super::skill::{Skill, skill};
 use super::surroundings::SurroundingsScores;
 use super::uncertainty::{NoveltyScores, UncertaintyScores};
@@ -279,6 +280,10 @@ pub struct SetScores {
     /// How often plans are identified by their predictions. Absent for a model that takes no actions.
     #[serde(default)]
     pub plans: Option<PlanOutcome>,
+    /// How often the plan that was driven is ranked first. Absent where the set is no recording, or the model takes no actions.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[doc(hidden)]
+    pub ranking: Option<PlanRanking>,
     /// Where movers are, and how far away things are. Absent for a model that does not tell.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[doc(hidden)]
@@ -309,6 +314,7 @@ impl SetScores {
             reconstruction_mse: StepCurve::new(by_trial(|window| &window.reconstruction_mse).means()),
             actions: None,
             plans: None,
+            ranking: None,
             surroundings: None,
             uncertainty: None,
             samples: SampleWindow::choose(windows),
