@@ -28,6 +28,7 @@ mod deployment;
 mod environments;
 mod evaluation;
 mod evaluation_parts;
+mod evaluation_ranking;
 mod export_mcap;
 mod fixtures;
 mod goal_image;
