@@ -26,7 +26,7 @@ use foreframe_train::evaluation::figures::episode_animation::episode_gif;
 ///
 /// With --out, writes drive.json (the scores and all episodes) and three GIFs for each driver: its best, its median and its worst
 /// episode, as in pid-best.gif. Those with a success come first, then those with fewer collisions, then the shorter ones. A GIF shows the
-/// camera's picture with the plan on the floor, and the room from above. These episodes are driven once more for that; with --budget-ms
+/// camera's picture with the plan on the floor, and the room from above, of an episode of more than half a minute its end. These episodes are driven once more for that; with --budget-ms
 /// they may differ from those of the scores.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:

@@ -1,5 +1,7 @@
 //! A driven episode as a GIF: what the camera shows, beside the room from above.
 
+use std::collections::VecDeque;
+
 use super::canvas::{Canvas, height_px};
 use super::montage::enlarged;
 use crate::evaluation::drive::{DriveError, DriveSettings, DriveStep, DriverKind, replay};
@@ -23,12 +25,17 @@ const TRACK: u8 = 170;
 const PLAN_IN_PICTURE: u8 = 255;
 /// Points of a way are not farther apart than this when the camera's picture shows it, in metres.
 const FINE_M: f32 = 0.02;
-/// Gray values of a camera's picture differ by at least this, so that the file stays small.
-const GRAY_STEP: u8 = 8;
+/// A larger file, in bytes, gets fewer gray values.
+const LARGE_BYTES: usize = 1_500_000;
+/// From one gray value to the next: what is tried until the file is not large.
+const GRAY_STEPS: [u8; 4] = [8, 16, 32, 64];
+/// Of a longer episode, these last steps are shown: half a minute with the usual five steps a second.
+const MAX_PICTURES: usize = 150;
 
 /// Drives an episode once more, and draws each step: on the left what the camera shows, with the way of the plan on the floor and the
 /// robot's circle at its end; on the right the room from above with walls and pieces (dark gray), all robots, the goal (a cross), the way
 /// driven so far and the plan (thick). Without a budget for plans, it is the same episode as in [`super::super::drive::run`].
+/// Of an episode of more than half a minute, its end is shown.
 /// Errors: as [`replay`].
 pub fn episode_gif(
     model: Option<&Model>,
@@ -36,7 +43,7 @@ pub fn episode_gif(
     driver: DriverKind,
     episode: usize,
 ) -> Result<Vec<u8>, DriveError> {
-    let mut pictures = Vec::new();
+    let mut pictures = VecDeque::new();
     let mut delay_ms = 0;
     let mut view: Option<RoomView> = None;
     replay(model, settings, driver, episode, &mut |step| {
@@ -49,11 +56,38 @@ pub fn episode_gif(
             format!("{:.1} s", step.world.observe().time_s),
             String::from(if step.world.touch().is_some() { "collision" } else { "" }),
         ];
-        pictures.push(joined(&picture, &captions, &view.draw(step)?)?);
+        if pictures.len() == MAX_PICTURES {
+            pictures.pop_front();
+        }
+        pictures.push_back(joined(&picture, &captions, &view.draw(step)?)?);
         delay_ms = (step.period_s * 1000.0).round() as u32;
         Ok(())
     })?;
-    Ok(codec::encode_gif(&pictures, delay_ms)?)
+    Ok(small_gif(&Vec::from(pictures), delay_ms, LARGE_BYTES)?)
+}
+
+/// A GIF with as many gray values as fit in that many bytes; a larger one if even the fewest do not.
+fn small_gif(pictures: &[Frame], delay_ms: u32, large_bytes: usize) -> Result<Vec<u8>, FrameError> {
+    let mut gif = Vec::new();
+    for gray_step in GRAY_STEPS {
+        let coarse: Vec<Frame> = pictures
+            .iter()
+            .map(|picture| coarser(picture, gray_step))
+            .collect::<Result<_, _>>()?;
+        gif = codec::encode_gif(&coarse, delay_ms)?;
+        if gif.len() <= large_bytes {
+            break;
+        }
+    }
+    Ok(gif)
+}
+
+/// The picture with fewer gray values; black and white stay.
+fn coarser(picture: &Frame, gray_step: u8) -> Result<Frame, FrameError> {
+    let most = u16::from(u8::MAX / gray_step);
+    let values = picture.pixels().iter();
+    let values = values.map(|value| (u16::from(value / gray_step) * 255 / most) as u8);
+    Frame::new(picture.width(), picture.height(), values.collect())
 }
 
 /// The camera's picture with the captions below it, and the room beside them.
@@ -74,8 +108,7 @@ fn joined(picture: &Frame, captions: &[String], room: &Frame) -> Result<Frame, F
 /// What the camera shows, enlarged, with the plan.
 fn camera_picture(step: &DriveStep<'_>) -> Result<Frame, FrameError> {
     let seen = step.world.observe().frame;
-    let coarse = seen.pixels().iter().map(|value| value / GRAY_STEP * GRAY_STEP);
-    let picture = enlarged(&Frame::new(seen.width(), seen.height(), coarse.collect())?)?;
+    let picture = enlarged(&seen)?;
     let [width, height] = [picture.width(), picture.height()];
     let scale = width as f32 / seen.width() as f32;
     let mut canvas = Canvas::new(width as usize, height as usize, PAPER);
@@ -270,6 +303,19 @@ mod tests {
         };
         let rows = with.height() as usize;
         assert!(!changed(0..rows / 2) && changed(rows / 2..rows));
+    }
+
+    #[test]
+    fn a_large_file_gets_fewer_gray_values() {
+        let noise = (0..64 * 64u32).map(|pixel| (pixel.wrapping_mul(2_654_435_761) >> 24) as u8);
+        let pictures = [Frame::new(64, 64, noise.collect()).unwrap()];
+        let fine = small_gif(&pictures, 200, LARGE_BYTES).unwrap();
+        let coarse = small_gif(&pictures, 200, fine.len() - 1).unwrap();
+        assert!(coarse.len() < fine.len());
+        assert_eq!(small_gif(&pictures, 200, fine.len()).unwrap(), fine);
+        let gray = Frame::new(4, 1, vec![0, 63, 192, 255]).unwrap();
+        assert_eq!(coarser(&gray, 64).unwrap().pixels(), [0, 0, 255, 255]);
+        assert_eq!(coarser(&gray, 8).unwrap().pixels(), [0, 57, 197, 255]);
     }
 
     #[test]
