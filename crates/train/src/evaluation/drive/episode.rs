@@ -13,7 +13,7 @@ use super::situation::Situation;
 use foreframe_core::frame::warp::CameraModel;
 use foreframe_core::registry::Model;
 use foreframe_core::types::Action;
-use foreframe_sim::{Scenario, World, WorldConfig};
+use foreframe_sim::{Scenario, Touch, World, WorldConfig};
 
 /// The robot has arrived at this distance from its goal, in metres.
 const ARRIVAL_M: f32 = 0.25;
@@ -75,6 +75,13 @@ impl EpisodeResult {
             stops: 0,
             planning_ms: PlanningTimes::default(),
         }
+    }
+
+    /// Counts a collision. `is_unseen`: whether it is with a robot that the camera had not shown.
+    fn count(&mut self, touch: Touch, is_unseen: bool) {
+        self.collisions += 1;
+        self.while_standing += usize::from(touch.speed_m_s < STANDING_M_S);
+        self.unseen += usize::from(is_unseen);
     }
 }
 
@@ -174,8 +181,7 @@ pub(super) fn drive(
             period_s,
         })
     };
-    let start = distance(&world, goal);
-    let mut result = EpisodeResult::at_start(start, world.gap_m());
+    let mut result = EpisodeResult::at_start(distance(&world, goal), world.gap_m());
     let (mut frames, mut states) = (VecDeque::new(), VecDeque::new());
     let mut views = RobotViews {
         recent: (SEEN_S / period_s).round() as u64,
@@ -213,14 +219,11 @@ pub(super) fn drive(
         was_moving = is_moving;
         let before = world.observer_pose();
         let step = world.step(&Action::try_from(command.to_vec())?)?;
-        let after = world.observer_pose();
-        result.way_m += f64::from((after.x_m - before.x_m).hypot(after.y_m - before.y_m));
+        result.way_m += f64::from(distance(&world, [before.x_m, before.y_m]));
         result.closest_m = result.closest_m.min(f64::from(world.gap_m()));
         let touch = world.touch();
         if let Some(touch) = touch.filter(|_| !was_touching) {
-            result.collisions += 1;
-            result.while_standing += usize::from(touch.speed_m_s < STANDING_M_S);
-            result.unseen += usize::from(touch.robot.is_some_and(|robot| !views.saw(robot, frame)));
+            result.count(touch, touch.robot.is_some_and(|robot| !views.saw(robot, frame)));
         }
         was_touching = touch.is_some();
         result.time_s = step.observation.time_s;

@@ -1,6 +1,6 @@
 //! Gray images to draw on: text from an 8×8 bitmap font, lines and discs.
 
-use std::ops::RangeInclusive;
+use std::ops::Range;
 
 use font8x8::{BASIC_FONTS, LATIN_FONTS, UnicodeFonts};
 use foreframe_core::frame::Frame;
@@ -87,14 +87,10 @@ impl Canvas {
     }
 
     /// The numbers of columns or rows that are within `half_px` of a place; those beyond the longest side are left out.
-    fn span(&self, middle: f32, half_px: f32) -> RangeInclusive<usize> {
+    fn span(&self, middle: f32, half_px: f32) -> Range<usize> {
         let last = self.longest_side() as f32;
         let [low, high] = [middle - half_px, middle + half_px].map(|edge| edge.clamp(-1.0, last));
-        if high < 0.0 {
-            // Empty.
-            return 1..=0;
-        }
-        low.ceil().max(0.0) as usize..=high.floor() as usize
+        low.ceil().max(0.0) as usize..(high.floor() + 1.0) as usize
     }
 
     fn longest_side(&self) -> usize {
