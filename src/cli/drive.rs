@@ -1,16 +1,20 @@
 //! `foreframe drive`
 
 use std::io::{IsTerminal as _, Write as _};
+use std::path::PathBuf;
 use std::time::Duration;
 
 use super::error::CliError;
+use super::output::OutputDirectory;
 use super::process::print_line;
 use super::settings::CommonArgs;
 use super::table::aligned;
 use super::workspace::Workspace;
+use foreframe_core::registry::Model;
 use foreframe_core::types::Seed;
 use foreframe_sim::{RoomSet, Scenario};
 use foreframe_train::evaluation::drive::{self, DriveScore, DriveSettings, DriverKind, DriverScores};
+use foreframe_train::evaluation::figures::episode_animation::episode_gif;
 
 /// Let robots drive to goals in the simulator, with several drivers in the same episodes.
 ///
@@ -19,10 +23,16 @@ use foreframe_train::evaluation::drive::{self, DriveScore, DriveSettings, Driver
 /// fast as in the last frames; places also knows where all robots are, seen or not; simulator plans with the simulator itself as the model, the upper limit. Goals can be reached on a
 /// straight line, but for the other robots. All drivers know where the goal is. The table has means over the episodes with 95 %
 /// bootstrap intervals.
+///
+/// With --out, writes drive.json (the scores and all episodes) and three GIFs for each driver: its best, its median and its worst
+/// episode, as in pid-best.gif. Those with a success come first, then those with fewer collisions, then the shorter ones. A GIF shows the
+/// camera's picture with the plan on the floor, and the room from above, of an episode of more than half a minute its end. These episodes are driven once more for that; with --budget-ms
+/// they may differ from those of the scores.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   foreframe drive --scenario crowded --episodes 50 --driver pid,simulator
-  foreframe drive --scenario crossing --rooms varied --model rooms --driver stop,velocity,plan --json")]
+  foreframe drive --scenario crossing --rooms varied --model rooms --driver stop,velocity,plan --json
+  foreframe drive --scenario crossing --model rooms --driver stop,plan --out drive")]
 pub(super) struct DriveArgs {
     /// The scenario: moving-observer, crowded or crossing
     #[arg(long, default_value = "crowded")]
@@ -51,6 +61,9 @@ pub(super) struct DriveArgs {
     /// Print the scores and all episodes as JSON
     #[arg(long)]
     json: bool,
+    /// A new directory for the GIFs and the scores
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
     #[command(flatten)]
     settings: CommonArgs,
 }
@@ -62,6 +75,8 @@ pub(super) fn run(args: &DriveArgs) -> Result<(), CliError> {
         .as_ref()
         .map(|model| workspace.load_model(model))
         .transpose()?;
+    let model = model.as_ref().map(|(_, model)| model);
+    let output = args.out.as_deref().map(OutputDirectory::create).transpose()?;
     let settings = DriveSettings {
         scenario: args.scenario,
         rooms: args.rooms,
@@ -72,7 +87,7 @@ pub(super) fn run(args: &DriveArgs) -> Result<(), CliError> {
         budget: args.budget_ms.map(Duration::from_millis),
     };
     let shows_progress = std::io::stderr().is_terminal();
-    let scores = drive::run(model.as_ref().map(|(_, model)| model), &settings, &|driver, episode| {
+    let scores = drive::run(model, &settings, &|driver, episode| {
         if shows_progress {
             // Progress that cannot be shown does not stop a drive.
             let _ = write!(
@@ -88,9 +103,41 @@ pub(super) fn run(args: &DriveArgs) -> Result<(), CliError> {
         let _ = writeln!(std::io::stderr());
     }
     let scores = scores?;
+    let files = output
+        .map(|output| write_files(output, model, &settings, &scores))
+        .transpose()?;
     if args.json {
         return print_line(serde_json::to_string(&scores).map_err(CliError::failed)?);
     }
+    print_table(&scores)?;
+    match (&args.out, files) {
+        (Some(out), Some(files)) => print_line(format!("{}: {}", out.display(), files.join(", "))),
+        _ => Ok(()),
+    }
+}
+
+/// Writes the scores and the GIFs; returns the names of the files.
+fn write_files(
+    output: OutputDirectory,
+    model: Option<&Model>,
+    settings: &DriveSettings,
+    scores: &[DriverScores],
+) -> Result<Vec<String>, CliError> {
+    let text = serde_json::to_string_pretty(scores).map_err(CliError::failed)?;
+    let mut files = vec!["drive.json".to_owned()];
+    output.write("drive.json", format!("{text}\n").as_bytes())?;
+    for of_driver in scores {
+        for (rank, episode) in of_driver.examples() {
+            let file = format!("{}-{rank}.gif", of_driver.driver.name());
+            output.write(&file, &episode_gif(model, settings, of_driver.driver, episode)?)?;
+            files.push(file);
+        }
+    }
+    output.finish()?;
+    Ok(files)
+}
+
+fn print_table(scores: &[DriverScores]) -> Result<(), CliError> {
     let header = [
         "driver",
         "success",

@@ -142,3 +142,65 @@ fn drivers_drive_the_same_episodes() {
     assert_eq!(code, Some(2));
     assert!(error.contains("driver plan needs a model; name one"), "{error}");
 }
+
+/// The number of pictures of a GIF: each has one graphic control extension with the delay of a step, 200 ms.
+fn pictures(gif: &[u8]) -> usize {
+    assert!(gif.starts_with(b"GIF89a"));
+    let control = [0x21, 0xf9, 4];
+    let delay = 20u16.to_le_bytes();
+    gif.windows(7)
+        .filter(|part| part[..3] == control && part[4..6] == delay)
+        .count()
+}
+
+#[test]
+fn a_drive_is_drawn_as_gifs() {
+    let dir = tempfile::tempdir().unwrap();
+    let drive = "drive --scenario crowded --episodes 2 --seed 4 --duration 8 --driver pid";
+    let (code, said, error) = run(dir.path(), &format!("{drive} --out driven"));
+    assert_eq!(code, Some(0), "{error}");
+    assert!(
+        said.contains("driven: drive.json, pid-best.gif, pid-median.gif, pid-worst.gif"),
+        "{said}"
+    );
+    let read = |file: &str| std::fs::read(dir.path().join("driven").join(file)).unwrap();
+    let scores: Value = serde_json::from_slice(&read("drive.json")).unwrap();
+    let (_, printed, _) = run(dir.path(), &format!("{drive} --json"));
+    let printed: Value = serde_json::from_str(&printed).unwrap();
+    assert_eq!(scores[0]["episodes"], printed[0]["episodes"]);
+    let mut episodes: Vec<&Value> = scores[0]["episodes"].as_array().unwrap().iter().collect();
+    episodes.sort_by(|one, two| {
+        let rank = |episode: &Value| {
+            let collisions = episode["collisions"].as_u64().unwrap();
+            let is_success = episode["arrived"] == true && collisions == 0;
+            (!is_success, collisions, episode["time_s"].as_f64().unwrap())
+        };
+        rank(one).partial_cmp(&rank(two)).unwrap()
+    });
+    let steps = |episode: &Value| (episode["time_s"].as_f64().unwrap() / 0.2).round() as usize;
+    assert_ne!(
+        steps(episodes[0]),
+        steps(episodes[1]),
+        "one cannot be taken for the other"
+    );
+    for (file, episode) in [("pid-best.gif", 0), ("pid-median.gif", 1), ("pid-worst.gif", 1)] {
+        let gif = read(file);
+        assert_eq!(pictures(&gif), steps(episodes[episode]), "{file}");
+        assert!(gif.len() < 1_500_000, "{file} has {} bytes", gif.len());
+    }
+}
+
+#[test]
+fn a_drive_that_cannot_be_written_says_why() {
+    let dir = tempfile::tempdir().unwrap();
+    std::fs::write(dir.path().join("taken"), b"mine").unwrap();
+    for (out, expected) in [
+        ("taken", "taken exists and is not an empty directory; name a new one"),
+        ("taken/inside", "could not make taken/inside: Not a directory"),
+    ] {
+        let (code, _, error) = run(dir.path(), &format!("drive --episodes 1 --driver pid --out {out}"));
+        assert_eq!(code, Some(2), "{error}");
+        assert!(error.contains(expected), "{error}");
+    }
+    assert_eq!(std::fs::read(dir.path().join("taken")).unwrap(), b"mine");
+}

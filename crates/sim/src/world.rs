@@ -259,6 +259,27 @@ impl World {
         gap_m(&self.physics, &self.room)
     }
 
+    /// Length and width of the room, in metres: x goes from 0 to the length, y from minus to plus half the width.
+    #[must_use]
+    #[doc(hidden)]
+    pub fn room_sides_m(&self) -> [f32; 2] {
+        [self.room.length_m, self.room.width_m]
+    }
+
+    /// Whether a wall or a piece of the room stands at a place, or the place is outside the room.
+    #[must_use]
+    #[doc(hidden)]
+    pub fn is_blocked(&self, place_m: [f32; 2]) -> bool {
+        self.room.gap_m(place_m) <= 0.0
+    }
+
+    /// The radius of Tb1, in metres.
+    #[must_use]
+    #[doc(hidden)]
+    pub fn observer_radius_m(&self) -> f32 {
+        self.physics.radius_m(0)
+    }
+
     /// A place for Tb1 to drive to: free, at least `least_m` away, not farther than `aside_rad` from straight ahead, and with a
     /// straight way that nothing stands on. Of several, one at random; `None` if there is none. Robots do not count.
     #[must_use]

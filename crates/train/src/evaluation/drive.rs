@@ -17,7 +17,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use foreframe_core::registry::Model;
 use rayon::prelude::*;
 
-pub use self::episode::EpisodeResult;
+pub use self::episode::{DriveStep, EpisodeResult};
 pub use self::error::DriveError;
 pub use self::scores::{DriveScore, DriverScores};
 pub use self::settings::{DriveSettings, DriverKind};
@@ -35,7 +35,7 @@ pub fn run(
     for &driver in &settings.drivers {
         let over = AtomicUsize::new(0);
         let drive = |episode| {
-            let result = episode::drive(driver, model, settings, episode);
+            let result = episode::drive(driver, model, settings, episode, &mut |_| Ok(()));
             on_episode(driver, over.fetch_add(1, Ordering::Relaxed) + 1);
             result
         };
@@ -46,6 +46,19 @@ pub fn run(
         scores.push(DriverScores::new(driver, results, settings.seed));
     }
     Ok(scores)
+}
+
+/// Drives one episode once more. `on_step` is called after each step, with the plan that the driver follows from there on. Without
+/// a budget for plans, what happens is the same as in [`run`]. Errors: as [`run`], and those of `on_step`.
+pub fn replay(
+    model: Option<&Model>,
+    settings: &DriveSettings,
+    driver: DriverKind,
+    episode: usize,
+    on_step: &mut dyn FnMut(&DriveStep<'_>) -> Result<(), DriveError>,
+) -> Result<EpisodeResult, DriveError> {
+    settings.check(model)?;
+    episode::drive(driver, model, settings, episode, on_step)
 }
 
 #[cfg(test)]

@@ -1,9 +1,11 @@
-//! Pictures of a model's predictions: panels like the paper's figures 6–8, error by horizon, an animation.
+//! Pictures of a model's predictions: panels like the paper's figures 6–8, error by horizon, an animation; and of plans and driven
+//! episodes.
 
 pub mod animation;
+mod canvas;
 mod chart;
+pub mod episode_animation;
 pub mod fan;
-mod lettering;
 pub mod montage;
 
 use self::montage::{MontageRow, Style, montage, prediction_panel};

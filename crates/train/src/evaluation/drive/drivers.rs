@@ -5,7 +5,7 @@ use std::time::Duration;
 use super::error::DriveError;
 use super::settings::DriverKind;
 use super::simulated::best_commands;
-use super::situation::{LIMITS, MARGIN_M, Situation, action};
+use super::situation::{LIMITS, MARGIN_M, Situation, action, in_room};
 use super::tracks::MoverTracks;
 use foreframe_core::planning::{Goal, Obstacles, PlanSettings, PlannerInput, SolverSettings, plan_around};
 use foreframe_core::registry::Model;
@@ -28,6 +28,8 @@ pub(super) struct EpisodeDriver<'a> {
     budget: Option<Duration>,
     /// The last plan without its first action.
     present: Vec<Action>,
+    /// The way of the last plan, in the room; empty for drivers that do not plan.
+    way_m: Vec<[f32; 2]>,
     tracks: MoverTracks,
 }
 
@@ -52,8 +54,14 @@ impl<'a> EpisodeDriver<'a> {
             seed,
             budget,
             present: Vec::new(),
+            way_m: Vec::new(),
             tracks: MoverTracks::default(),
         }
+    }
+
+    /// The way of the plan that the last command is from, in the room; empty for drivers that do not plan.
+    pub(super) fn way_m(&self) -> &[[f32; 2]] {
+        &self.way_m
     }
 
     /// The next command, m/s and rad/s.
@@ -131,6 +139,11 @@ impl<'a> EpisodeDriver<'a> {
             DriverKind::Places => tracks.extrapolate_true(&mut occupancy.movers, now.world),
             _ => {}
         })?;
+        let way = choice.best.motion.unwrap_or_default();
+        self.way_m = way
+            .iter()
+            .map(|&[_, ahead, left]| in_room(pose, [ahead, left]))
+            .collect();
         let mut actions = choice.best.actions.into_iter();
         let first = actions.next().map_or_else(Vec::new, Vec::from);
         self.present = actions.collect();
@@ -140,6 +153,8 @@ impl<'a> EpisodeDriver<'a> {
     fn simulated(&mut self, now: &Situation<'_>) -> Result<[f32; 2], DriveError> {
         let present: Vec<f32> = self.present.iter().flat_map(Action::as_slice).copied().collect();
         let commands = best_commands(now, &present, self.seed.derive("plan", now.frame).0);
+        let steps = now.world.try_plan(&commands);
+        self.way_m = steps.iter().map(|step| [step.pose.x_m, step.pose.y_m]).collect();
         self.present = commands
             .iter()
             .skip(1)

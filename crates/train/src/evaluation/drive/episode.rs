@@ -13,7 +13,7 @@ use super::situation::Situation;
 use foreframe_core::frame::warp::CameraModel;
 use foreframe_core::registry::Model;
 use foreframe_core::types::Action;
-use foreframe_sim::{Scenario, World, WorldConfig};
+use foreframe_sim::{Scenario, Touch, World, WorldConfig};
 
 /// The robot has arrived at this distance from its goal, in metres.
 const ARRIVAL_M: f32 = 0.25;
@@ -53,6 +53,49 @@ pub struct EpisodeResult {
     /// The time of each choice of a command, in milliseconds.
     #[serde(skip)]
     pub planning_ms: PlanningTimes,
+}
+
+impl EpisodeResult {
+    /// Whether the robot arrived without a collision.
+    pub(super) fn is_success(&self) -> bool {
+        self.arrived && self.collisions == 0
+    }
+
+    /// `shortest_m`: the straight way; `gap_m`: the distance to the nearest thing.
+    fn at_start(shortest_m: f32, gap_m: f32) -> Self {
+        Self {
+            arrived: false,
+            collisions: 0,
+            while_standing: 0,
+            unseen: 0,
+            time_s: 0.0,
+            way_m: 0.0,
+            shortest_m: f64::from(shortest_m),
+            closest_m: f64::from(gap_m),
+            stops: 0,
+            planning_ms: PlanningTimes::default(),
+        }
+    }
+
+    /// Counts a collision. `is_unseen`: whether it is with a robot that the camera had not shown.
+    fn count(&mut self, touch: Touch, is_unseen: bool) {
+        self.collisions += 1;
+        self.while_standing += usize::from(touch.speed_m_s < STANDING_M_S);
+        self.unseen += usize::from(is_unseen);
+    }
+}
+
+/// An episode after a step, for those who look on.
+#[derive(Clone, Copy)]
+pub struct DriveStep<'a> {
+    /// The world: robots, camera, time.
+    pub world: &'a World,
+    /// The goal, [x, y] in the room.
+    pub goal_m: [f32; 2],
+    /// The way of the plan that the driver follows from here on, in the room; empty without a plan.
+    pub plan_m: &'a [[f32; 2]],
+    /// From one step to the next, in seconds.
+    pub period_s: f32,
 }
 
 /// Times, which differ from run to run: they do not count when results are compared.
@@ -113,12 +156,13 @@ impl EpisodeStart {
     }
 }
 
-/// Drives an episode.
+/// Drives an episode. `on_step` is called after each step, and after the choice of the next command.
 pub(super) fn drive(
     kind: DriverKind,
     model: Option<&Model>,
     settings: &DriveSettings,
     episode: usize,
+    on_step: &mut dyn FnMut(&DriveStep<'_>) -> Result<(), DriveError>,
 ) -> Result<EpisodeResult, DriveError> {
     let EpisodeStart {
         mut world,
@@ -129,19 +173,15 @@ pub(super) fn drive(
     } = EpisodeStart::new(model, settings, episode)?;
     let seeds = (settings.seed.derive("driver", episode as u64), settings.budget);
     let mut driver = EpisodeDriver::new(kind, model, period_s, seeds);
-    let start = distance(&world, goal);
-    let mut result = EpisodeResult {
-        arrived: false,
-        collisions: 0,
-        while_standing: 0,
-        unseen: 0,
-        time_s: 0.0,
-        way_m: 0.0,
-        shortest_m: f64::from(start),
-        closest_m: f64::from(world.gap_m()),
-        stops: 0,
-        planning_ms: PlanningTimes::default(),
+    let mut show = |world: &World, plan_m: &[[f32; 2]]| {
+        on_step(&DriveStep {
+            world,
+            goal_m: goal,
+            plan_m,
+            period_s,
+        })
     };
+    let mut result = EpisodeResult::at_start(distance(&world, goal), world.gap_m());
     let (mut frames, mut states) = (VecDeque::new(), VecDeque::new());
     let mut views = RobotViews {
         recent: (SEEN_S / period_s).round() as u64,
@@ -171,19 +211,19 @@ pub(super) fn drive(
             command = driver.command(&now)?;
             result.planning_ms.0.push(begun.elapsed().as_secs_f64() * 1000.0);
         }
+        if frame > 0 {
+            show(&world, driver.way_m())?;
+        }
         let is_moving = command[0] > STANDING_M_S;
         result.stops += usize::from(was_moving && !is_moving);
         was_moving = is_moving;
         let before = world.observer_pose();
         let step = world.step(&Action::try_from(command.to_vec())?)?;
-        let after = world.observer_pose();
-        result.way_m += f64::from((after.x_m - before.x_m).hypot(after.y_m - before.y_m));
+        result.way_m += f64::from(distance(&world, [before.x_m, before.y_m]));
         result.closest_m = result.closest_m.min(f64::from(world.gap_m()));
         let touch = world.touch();
         if let Some(touch) = touch.filter(|_| !was_touching) {
-            result.collisions += 1;
-            result.while_standing += usize::from(touch.speed_m_s < STANDING_M_S);
-            result.unseen += usize::from(touch.robot.is_some_and(|robot| !views.saw(robot, frame)));
+            result.count(touch, touch.robot.is_some_and(|robot| !views.saw(robot, frame)));
         }
         was_touching = touch.is_some();
         result.time_s = step.observation.time_s;
@@ -192,6 +232,7 @@ pub(super) fn drive(
             break;
         }
     }
+    show(&world, &[])?;
     Ok(result)
 }
 

@@ -1,6 +1,7 @@
 //! Why a drive was refused or stopped.
 
 use foreframe_core::error_kind::{ErrorKind, HasErrorKind};
+use foreframe_core::frame::FrameError;
 use foreframe_core::nn::NnError;
 use foreframe_core::planning::PlanError;
 use foreframe_core::serving::{InputError, ServingError};
@@ -71,6 +72,9 @@ pub enum DriveError {
     /// The network failed.
     #[error("the motion of a plan could not be computed")]
     Network(#[from] NnError),
+    /// A picture of an episode could not be drawn.
+    #[error("the picture of an episode could not be drawn")]
+    Picture(#[from] FrameError),
     /// A command is not a number.
     #[error(transparent)]
     Action(#[from] ValueError),
@@ -82,7 +86,7 @@ impl HasErrorKind for DriveError {
             Self::Sim(error) => error.kind(),
             Self::Plan(error) => error.kind(),
             Self::Prediction(error) => error.kind(),
-            Self::Network(_) | Self::Action(_) => ErrorKind::Internal,
+            Self::Network(_) | Self::Picture(_) | Self::Action(_) => ErrorKind::Internal,
             _ => ErrorKind::Usage,
         }
     }

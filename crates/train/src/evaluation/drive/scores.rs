@@ -49,9 +49,27 @@ pub struct DriverScores {
 }
 
 impl DriverScores {
+    /// The best, the median and the worst episode, each with its name and number: those with a success come first, then those with
+    /// fewer collisions, then the shorter ones. Empty without episodes.
+    #[must_use]
+    pub fn examples(&self) -> Vec<(&'static str, usize)> {
+        let mut order: Vec<(usize, &EpisodeResult)> = self.episodes.iter().enumerate().collect();
+        order.sort_by(|(_, one), (_, two)| {
+            let rank = |result: &EpisodeResult| (!result.is_success(), result.collisions);
+            rank(one).cmp(&rank(two)).then(one.time_s.total_cmp(&two.time_s))
+        });
+        let places = [
+            ("best", 0),
+            ("median", order.len() / 2),
+            ("worst", order.len().saturating_sub(1)),
+        ];
+        let example = |(name, place): (&'static str, usize)| Some((name, order.get(place)?.0));
+        places.into_iter().filter_map(example).collect()
+    }
+
     pub(super) fn new(driver: DriverKind, episodes: Vec<EpisodeResult>, seed: Seed) -> Self {
         let row = |result: &EpisodeResult| {
-            let success = f64::from(u8::from(result.arrived && result.collisions == 0));
+            let success = f64::from(u8::from(result.is_success()));
             [
                 success,
                 f64::from(u8::from(result.arrived)),

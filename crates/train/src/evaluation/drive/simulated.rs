@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-use super::situation::{LIMITS, MARGIN_M, Situation};
+use super::situation::{LIMITS, MARGIN_M, Situation, in_room};
 use foreframe_core::planning::{SearchSpace, SolverSettings};
 use foreframe_sim::robot::wrap;
 
@@ -50,12 +50,8 @@ fn cost(now: &Situation<'_>, plan: &[f32]) -> f32 {
     let commands = plan.as_chunks::<2>().0;
     let steps = now.world.try_plan(commands);
     let start = now.world.observer_pose();
-    let (sin, cos) = start.heading_rad.sin_cos();
     let [ahead, left] = now.goal_m;
-    let goal = [
-        start.x_m + cos * ahead - sin * left,
-        start.y_m + sin * ahead + cos * left,
-    ];
+    let goal = in_room(start, now.goal_m);
     let Some(end) = steps.last().map(|step| step.pose) else {
         return f32::INFINITY;
     };

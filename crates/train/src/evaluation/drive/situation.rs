@@ -10,7 +10,7 @@ use foreframe_core::planning::{ActionLimit, PlanContext};
 use foreframe_core::registry::Model;
 use foreframe_core::serving::{ConditioningInput, Task, compute_task};
 use foreframe_core::types::{Action, RobotState};
-use foreframe_sim::World;
+use foreframe_sim::{PlanarPose, World};
 
 /// Limits of the commands, those of the recorded drives: m/s and rad/s.
 pub(super) const LIMITS: [ActionLimit; 2] = [
@@ -65,6 +65,12 @@ impl Situation<'_> {
         let seen = compute_task(model, &self.context(model)?.task(inputs, true))?;
         Ok(seen.occupancy.unwrap_or_default())
     }
+}
+
+/// The place in the room of what a robot with that pose has ahead and to the left, in metres.
+pub(super) fn in_room(pose: PlanarPose, [ahead, left]: [f32; 2]) -> [f32; 2] {
+    let (sin, cos) = pose.heading_rad.sin_cos();
+    [pose.x_m + cos * ahead - sin * left, pose.y_m + sin * ahead + cos * left]
 }
 
 pub(super) fn action(command: [f32; 2]) -> Result<Action, DriveError> {

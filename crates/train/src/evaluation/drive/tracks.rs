@@ -2,6 +2,7 @@
 
 use std::f32::consts::TAU;
 
+use super::situation::in_room;
 use foreframe_sim::{PlanarPose, World};
 
 /// Places of one mover are not farther apart than this, in metres.
@@ -30,12 +31,10 @@ impl MoverTracks {
             return;
         };
         let (sin, cos) = pose.heading_rad.sin_cos();
-        let in_room =
-            |[ahead, left]: [f32; 2]| [pose.x_m + cos * ahead - sin * left, pose.y_m + sin * ahead + cos * left];
         let groups = groups(now);
         let mut tracks = Vec::with_capacity(groups.len());
         for group in &groups {
-            let middle = in_room(mean(group));
+            let middle = in_room(pose, mean(group));
             let before = self.tracks.iter().filter_map(|track| {
                 let distance = distance(*track.last()?, middle);
                 (distance < LONGEST_STEP_M).then_some((distance, track))

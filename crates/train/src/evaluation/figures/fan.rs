@@ -1,6 +1,6 @@
 //! The ways of several plans, seen from above.
 
-use super::lettering::Canvas;
+use super::canvas::Canvas;
 use foreframe_core::frame::{Frame, FrameError};
 
 /// Side of the picture, in pixels.
@@ -93,28 +93,11 @@ impl FanView {
 
     /// A filled square, `half_px` to each side.
     fn dot(&mut self, place_m: [f32; 2], half_px: f32, ink: u8) {
-        let [x, y] = self.pixel(place_m);
-        let range = |middle: f32| {
-            let [low, high] = [middle - half_px, middle + half_px].map(|edge| edge.clamp(-1.0, SIDE_PX as f32));
-            low.ceil() as i64..=high.floor() as i64
-        };
-        for row in range(y) {
-            for column in range(x) {
-                if let (Ok(column), Ok(row)) = (usize::try_from(column), usize::try_from(row)) {
-                    self.canvas.set(column, row, ink);
-                }
-            }
-        }
+        self.canvas.dot(self.pixel(place_m), half_px, ink);
     }
 
     fn line(&mut self, from_m: [f32; 2], to_m: [f32; 2], half_px: f32, ink: u8) {
-        let length_px = (to_m[0] - from_m[0]).hypot(to_m[1] - from_m[1]) * self.px_per_m;
-        let steps = length_px.ceil().clamp(1.0, 4.0 * SIDE_PX as f32);
-        for step in 0..=steps as usize {
-            let part = step as f32 / steps;
-            let place = [0, 1].map(|axis| from_m[axis] + part * (to_m[axis] - from_m[axis]));
-            self.dot(place, half_px.max(0.5), ink);
-        }
+        self.canvas.line(self.pixel(from_m), self.pixel(to_m), half_px, ink);
     }
 
     fn circle(&mut self, [ahead, left]: [f32; 2], radius_m: f32, ink: u8) {

@@ -2,7 +2,7 @@
 
 use std::iter::{repeat, repeat_n};
 
-use super::lettering::{Canvas, height_px, width_px};
+use super::canvas::{Canvas, height_px, width_px};
 use foreframe_core::frame::{Frame, FrameError, MAX_SIDE_PX};
 
 const PAPER: u8 = 255;
