@@ -20,14 +20,14 @@ use foreframe_train::evaluation::figures::episode_animation::episode_gif;
 ///
 /// The drivers: pid drives straight to the goal and sees nothing; stop does the same, but stands while the model sees something on
 /// its way; plan follows the plan that the model finds, anew at every frame; velocity does the same, but expects movers to go on as
-/// fast as in the last frames; places also knows where all robots are, seen or not; simulator plans with the simulator itself as the model, the upper limit. Goals can be reached on a
-/// straight line, but for the other robots. All drivers know where the goal is. The table has means over the episodes with 95 %
-/// bootstrap intervals.
+/// fast as in the last frames; places also knows where all robots are, seen or not; simulator plans with the simulator itself as the
+/// model, the upper limit. Goals can be reached on a straight line, but for the other robots. All drivers know where the goal is. The
+/// table has means over the episodes with 95 % bootstrap intervals.
 ///
 /// With --out, writes drive.json (the scores and all episodes) and three GIFs for each driver: its best, its median and its worst
 /// episode, as in pid-best.gif. Those with a success come first, then those with fewer collisions, then the shorter ones. A GIF shows the
-/// camera's picture with the plan on the floor, and the room from above, of an episode of more than half a minute its end. These episodes are driven once more for that; with --budget-ms
-/// they may differ from those of the scores.
+/// camera's picture with the plan on the floor, and the room from above; of an episode of more than half a minute, its end. These
+/// episodes are driven once more for that; with --budget-ms they may differ from those of the scores.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   foreframe drive --scenario crowded --episodes 50 --driver pid,simulator
