@@ -103,15 +103,16 @@ pub(super) fn run(args: &DriveArgs) -> Result<(), CliError> {
         let _ = writeln!(std::io::stderr());
     }
     let scores = scores?;
+    if args.json {
+        print_line(serde_json::to_string(&scores).map_err(CliError::failed)?)?;
+    } else {
+        print_table(&scores)?;
+    }
     let files = output
         .map(|output| write_files(output, model, &settings, &scores))
         .transpose()?;
-    if args.json {
-        return print_line(serde_json::to_string(&scores).map_err(CliError::failed)?);
-    }
-    print_table(&scores)?;
     match (&args.out, files) {
-        (Some(out), Some(files)) => print_line(format!("{}: {}", out.display(), files.join(", "))),
+        (Some(out), Some(files)) if !args.json => print_line(format!("{}: {}", out.display(), files.join(", "))),
         _ => Ok(()),
     }
 }
@@ -142,8 +143,8 @@ fn print_table(scores: &[DriverScores]) -> Result<(), CliError> {
         "driver",
         "success",
         "collisions",
-        "of them standing",
-        "unseen",
+        "(standing)",
+        "(unseen)",
         "time s",
         "SPL",
         "closest m",

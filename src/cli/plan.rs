@@ -65,7 +65,7 @@ pub(super) struct PlanArgs {
     /// The time for the search, in milliseconds; without it, the search is whole, and the answer is always the same
     #[arg(long, value_name = "MS")]
     budget_ms: Option<u64>,
-    /// How many of the best plans are predicted and compared at the end; 0 is fastest
+    /// How many of the best plans are predicted and compared at the end
     #[arg(long, default_value_t = 4)]
     finalists: usize,
     /// Actions of a plan [default: the model's horizon]

@@ -57,8 +57,8 @@ pub(in crate::server) struct PlanSearch {
     /// The time for all of it; the best plan so far is the answer.
     #[schema(minimum = 1, maximum = 10_000)]
     budget_ms: u64,
-    /// How many of the best plans are predicted and compared at the end. 0 is fastest: only stopping is predicted.
-    #[schema(minimum = 0, maximum = 64)]
+    /// How many of the best plans are predicted and compared at the end.
+    #[schema(minimum = 1, maximum = 64)]
     finalists: usize,
     /// Radius of the robot's round footprint, in metres.
     #[schema(minimum = 0, maximum = 5)]
@@ -199,6 +199,7 @@ impl GivenToPlanner {
                 steps: search.steps,
                 budget: Some(Duration::from_millis(search.budget_ms)),
                 finalists: search.finalists,
+                predicts_plans: true,
                 radius_m: search.radius_m,
                 margin_m: search.margin_m,
                 robot_height_m: search.robot_height_m,

@@ -201,16 +201,29 @@ mod tests {
     }
 
     #[test]
-    fn without_finalists_only_stopping_is_predicted() {
+    fn a_search_without_predicted_plans_predicts_stopping_only() {
         let model = test_speed_model();
         let mut fast = input(SolverKind::Cem);
-        fast.settings.finalists = 0;
+        fast.settings.predicts_plans = false;
         fast.present = vec![action(0.2, 0.1)];
-        let choice = plan(&model, &context(&model), fast).unwrap();
+        let choice = plan(&model, &context(&model), fast.clone()).unwrap();
         assert_eq!((choice.predicted, choice.samples), (1, 64 * 4 + 2));
         assert_eq!((choice.best.kind, choice.unsafe_reason), (CandidateKind::Drawn, None));
         assert!(choice.best.rollout.is_none() && choice.best.motion.is_some());
         assert!(choice.best.actions.iter().all(|action| action.as_slice()[0] > 0.3));
+
+        // There is no time for a search: the present plan is known all the same.
+        fast.settings.budget = Some(Duration::from_millis(5));
+        let mut planner = Planner::new(&model, fast).unwrap();
+        let first = planner.next_batch(&|| Duration::ZERO).unwrap().unwrap();
+        assert_eq!(first.plans.len(), 1);
+        let late = Duration::from_millis(9);
+        planner
+            .record(predicted(&model, &context(&model), first), late)
+            .unwrap();
+        assert_eq!(planner.next_batch(&|| late).unwrap(), None);
+        let choice = planner.finish();
+        assert_eq!((choice.best.kind, choice.samples), (CandidateKind::Present, 2));
     }
 
     #[test]

@@ -30,7 +30,7 @@ pub struct PlanBatch {
 }
 
 enum Phase {
-    /// Stopping is predicted, with finalists also the present plan, and what stands in the way is looked at.
+    /// Stopping and the present plan are predicted, and what stands in the way is looked at.
     First,
     Search,
     /// The best plans are predicted.
@@ -107,8 +107,8 @@ impl Planner {
     pub fn next_batch(&mut self, elapsed: &dyn Fn() -> Duration) -> Result<Option<PlanBatch>, PlanError> {
         if matches!(self.phase, Phase::First) {
             let mut first = std::mem::take(&mut self.waiting);
-            if self.judge.input.settings.finalists == 0 && !self.judge.needs_frames() {
-                // The present plan is judged by its way, as all others.
+            if !self.predicts_plans() {
+                // Only stopping, the first, is predicted.
                 self.waiting = first.split_off(1);
             }
             self.phase = Phase::Search;
@@ -119,7 +119,12 @@ impl Planner {
                 return Ok(Some(batch));
             }
         }
-        let waiting = self.drawn.iter().take(self.judge.input.settings.finalists);
+        let finalists = if self.predicts_plans() {
+            self.judge.input.settings.finalists
+        } else {
+            0
+        };
+        let waiting = self.drawn.iter().take(finalists);
         let open = waiting.filter(|tried| tried.rollout.is_none()).count();
         let count = open.min(self.affordable(self.judge.input.settings.budget, elapsed()));
         let mut chosen = Vec::new();
@@ -147,7 +152,17 @@ impl Planner {
             tried
         };
         let predicted = asked.into_iter().zip(prediction.rollouts).map(with_rollout);
-        self.judge(predicted.collect())
+        self.judge(predicted.collect())?;
+        if !self.predicts_plans() {
+            let present = std::mem::take(&mut self.waiting);
+            self.judge(present)?;
+        }
+        Ok(())
+    }
+
+    /// Whether other plans than stopping are predicted.
+    fn predicts_plans(&self) -> bool {
+        self.judge.input.settings.predicts_plans || self.judge.needs_frames()
     }
 
     /// The best plan of those that were judged.
@@ -170,6 +185,7 @@ impl Planner {
         let all: Vec<&Tried> = self.fixed.iter().chain(&self.drawn).collect();
         // Costs of predicted frames count only if all that are compared have them.
         let has_rollouts = self.drawn.iter().any(|tried| tried.rollout.is_some()) || self.drawn.is_empty();
+        let has_rollouts = has_rollouts && self.predicts_plans();
         let mut compared: Vec<&Tried> = all
             .into_iter()
             .filter(|tried| !has_rollouts || tried.rollout.is_some())
@@ -212,11 +228,11 @@ impl Planner {
     /// One step of the search; a batch if frames are needed.
     fn search(&mut self, elapsed: &dyn Fn() -> Duration) -> Result<Option<PlanBatch>, PlanError> {
         let settings = &self.judge.input.settings;
-        let (budget, solver) = (settings.budget, settings.solver);
+        let (budget, solver, predicts_plans) = (settings.budget, settings.solver, self.predicts_plans());
         let search_end = *self.search_end.get_or_insert_with(|| {
             let budget = budget.unwrap_or(Duration::MAX);
             // Half of what is left is for the last predictions.
-            elapsed().saturating_add(budget.saturating_sub(elapsed()) / 2)
+            elapsed().saturating_add(budget.saturating_sub(elapsed()) / if predicts_plans { 2 } else { 1 })
         });
         if self.waiting.is_empty() {
             let is_begun = !self.scored.is_empty();
@@ -300,6 +316,6 @@ impl Planner {
         let mut like = like.into_iter();
         self.drawn.retain(|_| !like.next().unwrap_or(false));
         self.drawn.insert(place, tried);
-        self.drawn.truncate(self.judge.input.settings.finalists.max(1));
+        self.drawn.truncate(self.judge.input.settings.finalists);
     }
 }

@@ -94,9 +94,12 @@ pub struct PlanSettings {
     pub steps: Option<usize>,
     /// The time for all of it; the best plan so far is the answer.
     pub budget: Option<Duration>,
-    /// How many of the best plans are predicted and compared at the end; with 0, only stopping is predicted, which tells what stands
-    /// around the robot.
+    /// How many of the best plans are predicted and compared at the end.
     pub finalists: usize,
+    /// Whether plans are predicted. If not, only stopping is, which tells what stands around the robot: the fastest search. Plans
+    /// are then judged by their ways alone, without expected errors and novelty. A goal image needs predictions in any case.
+    #[doc(hidden)]
+    pub predicts_plans: bool,
     /// Radius of the robot's round footprint, in metres.
     pub radius_m: f32,
     /// The distance that the robot should keep, in metres.
@@ -114,6 +117,7 @@ impl Default for PlanSettings {
             steps: None,
             budget: None,
             finalists: 4,
+            predicts_plans: true,
             radius_m: 0.18,
             margin_m: 0.15,
             robot_height_m: 0.6,
@@ -132,7 +136,7 @@ impl PlanSettings {
             ("solver.noise_color", f64::from(solver.noise_color), [0.0, 8.0]),
             ("solver.temperature", f64::from(solver.temperature), [1e-3, 100.0]),
             ("budget_ms", budget, [1.0, 10_000.0]),
-            ("finalists", self.finalists as f64, [0.0, 64.0]),
+            ("finalists", self.finalists as f64, [1.0, 64.0]),
             ("radius_m", f64::from(self.radius_m), [0.0, 5.0]),
             ("margin_m", f64::from(self.margin_m), [0.0, 5.0]),
             ("robot_height_m", f64::from(self.robot_height_m), [0.15, 5.0]),

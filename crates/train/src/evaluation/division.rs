@@ -113,6 +113,7 @@ pub(super) fn inputs(inference: Inference, config: &EvaluateConfig, split_seed: 
         let manifest = &model.manifest;
         json!({
             "weights": manifest.weights_sha256, "spec": model.spec(), "calibration": manifest.calibration, "trained_on": manifest.dataset,
+            "mirrored": manifest.training["data"]["mirror"],
         })
     };
     let inputs = json!({

@@ -13,9 +13,9 @@ mod situation;
 mod tracks;
 
 use std::sync::atomic::{AtomicUsize, Ordering};
+use std::thread;
 
 use foreframe_core::registry::Model;
-use rayon::prelude::*;
 
 pub use self::episode::{DriveStep, EpisodeResult};
 pub use self::error::DriveError;
@@ -23,8 +23,8 @@ pub use self::scores::{DriveScore, DriverScores};
 pub use self::settings::{DriveSettings, DriverKind};
 
 /// Drives every episode with every driver, side by side on all cores. `model`: needed by those that see or plan with one.
-/// `on_episode` is called after each episode of a driver, with how many are over. Errors: a driver without the model that it needs, a scenario in which Tb1 does not drive, those of the simulator
-/// and of the predictions.
+/// `on_episode` is called after each episode of a driver, with how many are over. Errors: a driver without the model that it needs, a
+/// scenario in which Tb1 does not drive, those of the simulator and of the predictions.
 pub fn run(
     model: Option<&Model>,
     settings: &DriveSettings,
@@ -33,16 +33,33 @@ pub fn run(
     settings.check(model)?;
     let mut scores = Vec::new();
     for &driver in &settings.drivers {
-        let over = AtomicUsize::new(0);
-        let drive = |episode| {
-            let result = episode::drive(driver, model, settings, episode, &mut |_| Ok(()));
-            on_episode(driver, over.fetch_add(1, Ordering::Relaxed) + 1);
-            result
+        let (next, over) = (AtomicUsize::new(0), AtomicUsize::new(0));
+        let drive = || {
+            let mut results = Vec::new();
+            loop {
+                let episode = next.fetch_add(1, Ordering::Relaxed);
+                if episode >= settings.episodes {
+                    return Ok(results);
+                }
+                let result = episode::drive(driver, model, settings, episode, &mut |_| Ok(()))?;
+                on_episode(driver, over.fetch_add(1, Ordering::Relaxed) + 1);
+                results.push((episode, result));
+            }
         };
-        let results = (0..settings.episodes)
-            .into_par_iter()
-            .map(drive)
-            .collect::<Result<_, _>>()?;
+        // Not rayon's threads: while one of those waits for a plan, it would drive another episode, and the plan's time would be wrong.
+        let mut results = thread::scope(|scope| {
+            let count = thread::available_parallelism()
+                .map_or(1, usize::from)
+                .min(settings.episodes);
+            let threads: Vec<_> = (0..count).map(|_| scope.spawn(drive)).collect();
+            let ended = threads
+                .into_iter()
+                .map(|thread| thread.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)));
+            ended.collect::<Result<Vec<_>, DriveError>>()
+        })?
+        .concat();
+        results.sort_by_key(|(episode, _)| *episode);
+        let results = results.into_iter().map(|(_, result)| result).collect();
         scores.push(DriverScores::new(driver, results, settings.seed));
     }
     Ok(scores)

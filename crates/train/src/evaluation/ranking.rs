@@ -1,6 +1,6 @@
-//! Would a planner choose what was driven? A recording has one future, that of its own actions. Where the driver turned most, the
-//! camera's picture at the end is taken as a goal image: among the plan that was driven, the same mirrored, and plans of other
-//! windows, how often does the model predict that picture best under the one that was driven?
+//! Would a planner choose what was driven? A recording has one future, that of its own actions. Where its actions
+//! change most, the camera's picture at the end is taken as a goal image: among the driven plan, the same mirrored, and plans of other
+//! windows, how often does the model predict that picture best under the driven one?
 
 use rand::Rng;
 use serde::{Deserialize, Serialize};
@@ -49,7 +49,7 @@ pub struct RankingRate {
     pub chance: f64,
 }
 
-/// For each moment, at how many of the plans of each ranking the driven one is beaten or equalled. Empty if the data set is no
+/// For each moment and ranking, how many other plans are at least as good as the driven one. Empty if the data set is no
 /// recording or has too few windows. Errors: those of the network, `Cancelled`.
 pub(super) fn rank(evaluation: &EvaluationContext, windows: &[Window]) -> Result<Vec<Vec<usize>>, EvaluationError> {
     let inference = evaluation.inference;
@@ -69,7 +69,10 @@ pub(super) fn rank(evaluation: &EvaluationContext, windows: &[Window]) -> Result
         ..evaluation.pass(EvaluationStage::Ranking)
     };
     evaluation.in_divided_batches(pass, &moments, |moments| {
-        let rank = |&(moment, seed)| places(inference, (moment, windows), &mirrored, seed);
+        let rank = |&(moment, seed)| {
+            let plans = plans(inference, (moment, windows), &mirrored, seed);
+            better_plans(evaluation, moment, &plans)
+        };
         moments.iter().map(rank).collect()
     })
 }
@@ -141,7 +144,7 @@ fn moments(inference: Inference, windows: &[Window]) -> Vec<usize> {
     (0..count).map(|nth| moments[nth * moments.len() / count]).collect()
 }
 
-/// The mean squared change of a window's actions from the one that led to the last frame seen, in the channels' spread.
+/// The sum of the squared changes of a window's actions from the one that led to the last frame seen, in the channels' spread.
 fn change(inference: Inference, window: Window) -> f32 {
     let spec = inference.spec();
     let last = window.first_frame + spec.context - 1;
@@ -153,40 +156,44 @@ fn change(inference: Inference, window: Window) -> f32 {
     squares.sum()
 }
 
-/// Predicts the plans of a moment; of each ranking, how many other plans predict the last picture as well as the driven one.
-fn places(
-    inference: Inference,
-    (own, windows): (Window, &[Window]),
-    mirrored: &[usize],
-    seed: Seed,
-) -> Result<Vec<usize>, EvaluationError> {
+/// The actions of the plans of a moment: its own, the same mirrored, then those of other windows, each at most once.
+fn plans(inference: Inference, (own, windows): (Window, &[Window]), mirrored: &[usize], seed: Seed) -> Vec<f32> {
     let spec = inference.spec();
-    let length = spec.context + spec.horizon;
-    let mut rng = seed.rng();
-    let mut plans = actions_of(inference, own);
-    let driven = plans.clone();
+    let driven = actions_of(inference, own);
+    let mut plans = driven.clone();
     if !mirrored.is_empty() {
-        for action in plans.clone().chunks_exact(spec.actions.len()) {
+        for action in driven.chunks_exact(spec.actions.len()) {
             let sign = |channel: usize| if mirrored.contains(&channel) { -1.0 } else { 1.0 };
             plans.extend(action.iter().enumerate().map(|(channel, value)| sign(channel) * value));
         }
     }
-    while plans.len() < PLANS * driven.len() {
-        let other = windows[rng.random_range(0..windows.len())];
-        // Windows that overlap were driven nearly alike.
-        if other.first_frame.abs_diff(own.first_frame) >= length {
-            plans.extend(actions_of(inference, other));
-        }
+    // Windows that overlap were driven nearly alike.
+    let length = spec.context + spec.horizon;
+    let is_apart = |other: &&Window| other.first_frame.abs_diff(own.first_frame) >= length;
+    let mut others: Vec<Window> = windows.iter().filter(is_apart).copied().collect();
+    let mut rng = seed.rng();
+    for nth in 0..PLANS - plans.len() / driven.len() {
+        let drawn = rng.random_range(nth..others.len());
+        others.swap(nth, drawn);
+        plans.extend(actions_of(inference, others[nth]));
     }
-    let predicted = inference.predict(&[own; PLANS], ActionSource::Given(&plans))?.frames;
-    let truth = true_frame(inference.dataset, own.first_frame + length - 1)?;
-    let errors: Vec<f64> = predicted
-        .chunks_exact(spec.horizon * spec.pixels())
-        .map(|frames| {
+    plans
+}
+
+/// Predicts the plans of a moment; of each ranking, how many other plans predict the last picture at least as well as the driven one.
+fn better_plans(evaluation: &EvaluationContext, own: Window, plans: &[f32]) -> Result<Vec<usize>, EvaluationError> {
+    let inference = evaluation.inference;
+    let spec = inference.spec();
+    let truth = true_frame(inference.dataset, own.first_frame + spec.context + spec.horizon - 1)?;
+    let mut errors = Vec::with_capacity(PLANS);
+    for plans in plans.chunks(evaluation.config.batch * plans.len() / PLANS) {
+        let repeated = vec![own; plans.len() / (spec.horizon * spec.actions.len())];
+        let predicted = inference.predict(&repeated, ActionSource::Given(plans))?.frames;
+        errors.extend(predicted.chunks_exact(spec.horizon * spec.pixels()).map(|frames| {
             let last = &frames[(spec.horizon - 1) * spec.pixels()..];
             quality::mse(&spec.preprocess.inverse(last), &truth)
-        })
-        .collect();
+        }));
+    }
     Ok(RANKINGS.map(|(plans, _)| as_good(&errors[..plans])).into())
 }
 

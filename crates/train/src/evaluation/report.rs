@@ -280,7 +280,8 @@ pub struct SetScores {
     /// How often plans are identified by their predictions. Absent for a model that takes no actions.
     #[serde(default)]
     pub plans: Option<PlanOutcome>,
-    /// How often the plan that was driven is ranked first. Absent where the set is no recording, or the model takes no actions.
+    /// How often the driven plan is ranked first. Absent where the set is no recording or has too few windows, or the model takes no
+    /// actions.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[doc(hidden)]
     pub ranking: Option<PlanRanking>,

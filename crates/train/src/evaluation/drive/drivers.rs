@@ -122,7 +122,7 @@ impl<'a> EpisodeDriver<'a> {
                 },
                 limits: Some(LIMITS.to_vec()),
                 budget: self.budget,
-                finalists: 0,
+                predicts_plans: false,
                 radius_m: RADIUS_M,
                 margin_m: MARGIN_M,
                 ..PlanSettings::default()

@@ -36,9 +36,9 @@ pub struct EpisodeResult {
     pub arrived: bool,
     /// How often it began to touch something.
     pub collisions: usize,
-    /// Of these, those in which its wheels stood: something drove into it.
+    /// Collisions in which it did not drive forward: it stood or turned on the spot.
     pub while_standing: usize,
-    /// Of these, those with a robot that the camera had not shown in the two seconds before.
+    /// Collisions with a robot that the camera had not shown in the two seconds before.
     pub unseen: usize,
     /// The time until it arrived, or all of it, in seconds.
     pub time_s: f64,

@@ -30,9 +30,9 @@ pub struct DriverScores {
     pub arrived: DriveScore,
     /// Collisions of an episode.
     pub collisions: DriveScore,
-    /// Of these, those in which the robot stood and something drove into it.
+    /// Those in which the robot did not drive forward.
     pub while_standing: DriveScore,
-    /// Of these, those with a robot that the camera had not shown in the two seconds before.
+    /// Those with a robot that the camera had not shown in the two seconds before.
     pub unseen: DriveScore,
     /// Time of an episode, in seconds; all of it if the robot did not arrive.
     pub time_s: DriveScore,

@@ -66,7 +66,7 @@ impl MoverTracks {
             .collect();
         let pose = world.observer_pose();
         let (sin, cos) = pose.heading_rad.sin_cos();
-        for (places_then, steps) in movers.iter_mut().zip(0u8..) {
+        for (places_then, steps) in movers.iter_mut().zip(0u16..) {
             let robots = places.iter().enumerate().flat_map(|(robot, &[x, y])| {
                 let [x_before, y_before] = self.places.get(robot).copied().unwrap_or([x, y]);
                 let steps = f32::from(steps);
