@@ -201,10 +201,9 @@ async fn only_cancelled_or_failed_jobs_can_be_resumed() {
     );
     post(&app, "/v1/jobs/job-1/cancel", &Value::Null).await;
     wait_for_state(&app, "job-1", "cancelled").await;
-    assert_eq!(
-        post(&app, "/v1/jobs/job-1/resume", &Value::Null).await.json()["state"],
-        "queued"
-    );
+    let resumed = post(&app, "/v1/jobs/job-1/resume", &Value::Null).await.json()["state"].clone();
+    // A runner can have claimed it before it was read for the answer.
+    assert!(resumed == "queued" || resumed == "running", "{resumed}");
     finish.send(Err(JobFailure::Failed("no luck".to_owned()))).unwrap();
     let path = "/v1/jobs/job-1";
     let failed = poll_until(async || Some(get(&app, path).await.json()).filter(|job| job["state"] == "failed")).await;
