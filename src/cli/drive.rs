@@ -22,7 +22,9 @@ use foreframe_train::evaluation::figures::episode_animation::episode_gif;
 /// its way; plan follows the plan that the model finds, anew at every frame; velocity does the same, but expects movers to go on as
 /// fast as in the last frames; places also knows where all robots are, seen or not; simulator plans with the simulator itself as the
 /// model, the upper limit. Goals can be reached on a straight line, but for the other robots. All drivers know where the goal is. The
-/// table has means over the episodes with 95 % bootstrap intervals.
+/// table has means over the episodes with 95 % bootstrap intervals. Of the collisions, (standing) are those in which the robot stood or
+/// turned on the spot, (unseen) those with a robot that its camera had not shown in the two seconds before. Episodes run side by side on all
+/// cores.
 ///
 /// With --out, writes drive.json (the scores and all episodes) and three GIFs for each driver: its best, its median and its worst
 /// episode, as in pid-best.gif. Those with a success come first, then those with fewer collisions, then the shorter ones. A GIF shows the

@@ -176,15 +176,12 @@ impl PhysicsScene {
 
     /// Whether the robot touches a wall, a pillar or another robot.
     pub(super) fn is_touching(&self, robot: usize) -> bool {
-        let mut contacts = self.physics.contact_pairs_with(self.robots[robot].collider);
-        contacts.any(ContactPair::has_any_active_contact)
+        self.contact(robot).is_some()
     }
 
     /// What the robot touches; the first of several, `None` if it touches nothing.
     pub(super) fn touch(&self, robot: usize) -> Option<Touch> {
-        let own = &self.robots[robot];
-        let mut contacts = self.physics.contact_pairs_with(own.collider);
-        let contact = contacts.find(|pair| pair.has_any_active_contact())?;
+        let (own, contact) = (&self.robots[robot], self.contact(robot)?);
         let other = if contact.collider1 == own.collider {
             contact.collider2
         } else {
@@ -194,6 +191,11 @@ impl PhysicsScene {
             speed_m_s: own.drive.velocity().0,
             robot: self.robots.iter().position(|robot| robot.collider == other),
         })
+    }
+
+    fn contact(&self, robot: usize) -> Option<&ContactPair> {
+        let mut contacts = self.physics.contact_pairs_with(self.robots[robot].collider);
+        contacts.find(|pair| pair.has_any_active_contact())
     }
 }
 

@@ -184,8 +184,8 @@ impl Planner {
         };
         let all: Vec<&Tried> = self.fixed.iter().chain(&self.drawn).collect();
         // Costs of predicted frames count only if all that are compared have them.
-        let has_rollouts = self.drawn.iter().any(|tried| tried.rollout.is_some()) || self.drawn.is_empty();
-        let has_rollouts = has_rollouts && self.predicts_plans();
+        let has_rollouts =
+            self.predicts_plans() && (self.drawn.is_empty() || self.drawn.iter().any(|tried| tried.rollout.is_some()));
         let mut compared: Vec<&Tried> = all
             .into_iter()
             .filter(|tried| !has_rollouts || tried.rollout.is_some())
@@ -231,8 +231,9 @@ impl Planner {
         let (budget, solver, predicts_plans) = (settings.budget, settings.solver, self.predicts_plans());
         let search_end = *self.search_end.get_or_insert_with(|| {
             let budget = budget.unwrap_or(Duration::MAX);
-            // Half of what is left is for the last predictions.
-            elapsed().saturating_add(budget.saturating_sub(elapsed()) / if predicts_plans { 2 } else { 1 })
+            let left = budget.saturating_sub(elapsed());
+            // Half of what is left is for the last predictions, if there will be any.
+            elapsed().saturating_add(if predicts_plans { left / 2 } else { left })
         });
         if self.waiting.is_empty() {
             let is_begun = !self.scored.is_empty();

@@ -180,13 +180,13 @@ impl<'a> Inference<'a> {
             let mut actions = Vec::with_capacity(batch * spec.horizon * count);
             let acting = match source {
                 ActionSource::OfWindows(others) => others,
+                ActionSource::Given(given) => {
+                    actions.extend_from_slice(given);
+                    &[]
+                }
                 _ => windows,
             };
-            if let ActionSource::Given(given) = source {
-                actions.extend_from_slice(given);
-            }
-            let is_given = matches!(source, ActionSource::Given(_));
-            for window in acting.iter().filter(|_| !is_given) {
+            for window in acting {
                 for step in 0..spec.horizon {
                     let place = match source {
                         ActionSource::Held => last.saturating_sub(1),

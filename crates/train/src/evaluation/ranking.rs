@@ -14,7 +14,7 @@ use foreframe_core::frame::quality;
 use foreframe_core::types::Seed;
 use foreframe_data::dataset::Window;
 
-/// Plans among which the driven one is ranked, and the last place that counts: first of 8, among the first 5 of 64.
+/// Plans among which the driven one is ranked, and the places that count: top-1 of 8, top-5 of 64.
 const RANKINGS: [(usize, usize); 2] = [(8, 1), (64, 5)];
 /// Plans that are predicted for each moment: enough for the largest ranking.
 const PLANS: usize = RANKINGS[1].0;
@@ -23,24 +23,24 @@ const MOMENT_SHARE: usize = 4;
 /// Moments at most.
 const MAX_MOMENTS: usize = 120;
 
-/// How often the plan that was driven is ranked among the first.
+/// How often the driven plan is ranked among the first.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct PlanRanking {
     /// Moments at which plans were compared.
     pub moments: usize,
     /// Whether the mirrored plan was among them.
     pub has_mirrored: bool,
-    /// First of 8, then among the first 5 of 64.
+    /// Top-1 of 8, then top-5 of 64.
     pub rates: Vec<RankingRate>,
 }
 
-/// How often the plan that was driven comes among the first.
+/// The same, among so many plans.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct RankingRate {
     /// Plans that were compared.
     pub plans: usize,
-    /// The last place that counts.
-    pub first: usize,
+    /// So many first places count.
+    pub top: usize,
     /// The share of the moments.
     pub rate: f64,
     /// Its 95 % bootstrap interval over blocks; absent with fewer than two blocks.
@@ -77,15 +77,15 @@ pub(super) fn rank(evaluation: &EvaluationContext, windows: &[Window]) -> Result
     })
 }
 
-/// The rates, from what [`rank`] gives for these windows. `group_of`: the block of each window.
+/// The rates. `better`: what [`rank`] gives for these windows; `group_of`: the block of each window.
 pub(super) fn rates(
     evaluation: &EvaluationContext,
     windows: &[Window],
     group_of: &[usize],
-    places: &[Vec<usize>],
+    better: &[Vec<usize>],
     bootstrap: &Bootstrap,
 ) -> Option<PlanRanking> {
-    if places.is_empty() {
+    if better.is_empty() {
         return None;
     }
     let inference = evaluation.inference;
@@ -93,23 +93,23 @@ pub(super) fn rates(
         .into_iter()
         .map(|moment| group_of[moment])
         .collect();
-    let row = |places: &Vec<usize>| -> Vec<f64> {
-        let pairs = places.iter().zip(RANKINGS);
+    let row = |better: &Vec<usize>| -> Vec<f64> {
+        let pairs = better.iter().zip(RANKINGS);
         pairs
-            .map(|(&better, (_, first))| f64::from(u8::from(better < first)))
+            .map(|(&better, (_, top))| f64::from(u8::from(better < top)))
             .collect()
     };
-    let sums = TrialSums::group(&own, places.iter().map(row));
+    let sums = TrialSums::group(&own, better.iter().map(row));
     let (means, intervals) = (sums.means(), sums.intervals(bootstrap, <[f64]>::to_vec));
-    let rate = |(index, (plans, first)): (usize, (usize, usize))| RankingRate {
+    let rate = |(index, (plans, top)): (usize, (usize, usize))| RankingRate {
         plans,
-        first,
+        top,
         rate: means[index],
         interval: intervals.as_ref().map(|all| all[index]),
-        chance: first as f64 / plans as f64,
+        chance: top as f64 / plans as f64,
     };
     Some(PlanRanking {
-        moments: places.len(),
+        moments: better.len(),
         has_mirrored: !mirrored_channels(inference).is_empty(),
         rates: RANKINGS.into_iter().enumerate().map(rate).collect(),
     })

@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 use super::drivers::EpisodeDriver;
 use super::error::DriveError;
 use super::settings::{DriveSettings, DriverKind};
-use super::situation::Situation;
+use super::situation::{Situation, seen_from};
 use foreframe_core::frame::warp::CameraModel;
 use foreframe_core::registry::Model;
 use foreframe_core::types::Action;
@@ -204,7 +204,7 @@ pub(super) fn drive(
                 frames: &frames,
                 states: &states,
                 camera,
-                goal_m: seen_from(&world, goal),
+                goal_m: seen_from(world.observer_pose(), goal),
                 frame,
             };
             let begun = Instant::now();
@@ -263,12 +263,4 @@ impl RobotViews {
 fn distance(world: &World, [x, y]: [f32; 2]) -> f32 {
     let pose = world.observer_pose();
     (x - pose.x_m).hypot(y - pose.y_m)
-}
-
-/// A place as seen from the robot: metres ahead and to the left.
-fn seen_from(world: &World, [x, y]: [f32; 2]) -> [f32; 2] {
-    let pose = world.observer_pose();
-    let (sin, cos) = pose.heading_rad.sin_cos();
-    let (x, y) = (x - pose.x_m, y - pose.y_m);
-    [cos * x + sin * y, cos * y - sin * x]
 }

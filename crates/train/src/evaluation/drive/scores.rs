@@ -30,9 +30,9 @@ pub struct DriverScores {
     pub arrived: DriveScore,
     /// Collisions of an episode.
     pub collisions: DriveScore,
-    /// Those in which the robot did not drive forward.
+    /// Collisions in which the robot did not drive forward.
     pub while_standing: DriveScore,
-    /// Those with a robot that the camera had not shown in the two seconds before.
+    /// Collisions with a robot that the camera had not shown in the two seconds before.
     pub unseen: DriveScore,
     /// Time of an episode, in seconds; all of it if the robot did not arrive.
     pub time_s: DriveScore,

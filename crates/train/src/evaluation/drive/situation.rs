@@ -73,6 +73,13 @@ pub(super) fn in_room(pose: PlanarPose, [ahead, left]: [f32; 2]) -> [f32; 2] {
     [pose.x_m + cos * ahead - sin * left, pose.y_m + sin * ahead + cos * left]
 }
 
+/// A place in the room as a robot with that pose has it: metres ahead and to the left.
+pub(super) fn seen_from(pose: PlanarPose, [x, y]: [f32; 2]) -> [f32; 2] {
+    let (sin, cos) = pose.heading_rad.sin_cos();
+    let (x, y) = (x - pose.x_m, y - pose.y_m);
+    [cos * x + sin * y, cos * y - sin * x]
+}
+
 pub(super) fn action(command: [f32; 2]) -> Result<Action, DriveError> {
     Ok(Action::try_from(command.to_vec())?)
 }

@@ -2,7 +2,7 @@
 
 use std::f32::consts::TAU;
 
-use super::situation::in_room;
+use super::situation::{in_room, seen_from};
 use foreframe_sim::{PlanarPose, World};
 
 /// Places of one mover are not farther apart than this, in metres.
@@ -65,7 +65,6 @@ impl MoverTracks {
             .map(|pose| [pose.x_m, pose.y_m])
             .collect();
         let pose = world.observer_pose();
-        let (sin, cos) = pose.heading_rad.sin_cos();
         for (places_then, steps) in movers.iter_mut().zip(0u16..) {
             let robots = places.iter().enumerate().flat_map(|(robot, &[x, y])| {
                 let [x_before, y_before] = self.places.get(robot).copied().unwrap_or([x, y]);
@@ -77,11 +76,7 @@ impl MoverTracks {
                     [middle[0] + radius * cos, middle[1] + radius * sin]
                 })
             });
-            let seen = robots.map(|[x, y]| {
-                let (x, y) = (x - pose.x_m, y - pose.y_m);
-                [cos * x + sin * y, cos * y - sin * x]
-            });
-            *places_then = seen.collect();
+            *places_then = robots.map(|place| seen_from(pose, place)).collect();
         }
         self.places = places;
     }
