@@ -24,8 +24,10 @@ from foreframe.export_onnx import UnsupportedModel, export_onnx  # noqa: E402
 
 NAMES = sorted(path.parent.name for path in MODELS.glob("*/manifest.json"))
 DENSE, FLOW = ["moving", "static"], ["moving-flow", "rooms"]
-#: Of full scale. Both compute in float32, in another order.
+#: Of full scale. Sums are in another order, and NumPy computes places in float64.
 TOLERANCE = 1e-5
+#: At sharp edges, a place that is a little elsewhere is another depth, and so another place.
+DEPTH_TOLERANCE = 5e-5
 
 Window = dict[str, np.ndarray]
 
@@ -97,14 +99,15 @@ class ByOnnx:
 @pytest.mark.parametrize("name", NAMES)
 def test_a_batch_of_windows_is_as_by_numpy_and_by_the_server(name: str, client: foreframe.Client, drive: Drive) -> None:
     by_numpy = ByNumpy(MODELS / name)
+    tolerance = DEPTH_TOLERANCE if by_numpy.flow.get("depth") else TOLERANCE
     windows = [by_numpy.window(drive, last) for last in (4, 6)]
     for window, predicted in zip(windows, ByOnnx(MODELS / name)(*windows)["predicted"], strict=True):
-        assert np.abs(predicted - by_numpy.predict(window)).max() < TOLERANCE
+        assert np.abs(predicted - by_numpy.predict(window)).max() < tolerance
         levels = np.rint(window["frames"] * 255).astype(np.uint8)
         known = {key: window[key] for key in ("state", "states") if key in window}
         served = client.predict(name, levels, plan=window.get("actions"), **known).frames
         # The server rounds to a level.
-        assert np.abs(predicted * 255 - served).max() < 0.5 + 255 * TOLERANCE
+        assert np.abs(predicted * 255 - served).max() < 0.5 + 255 * tolerance
 
 
 @pytest.mark.parametrize("name", DENSE)
@@ -156,7 +159,7 @@ def test_another_camera_gives_another_prediction(drive: Drive) -> None:
     by_numpy.spec["camera"] = camera
     other = window | {"camera": np.array(list(camera.values()), np.float32)}
     own, predicted = ByOnnx(MODELS / "rooms")(window, other)["predicted"]
-    assert np.abs(predicted - by_numpy.predict(window)).max() < TOLERANCE
+    assert np.abs(predicted - by_numpy.predict(window)).max() < DEPTH_TOLERANCE
     assert np.abs(predicted - own).max() > 0.01
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from .flow import FlowLayers, quarter_places
 from .geometry import Place, Turn, Vector, Viewer, centred, sample
-from .graph import Graph, Tensor, Value, clip, concat, mean, where
+from .graph import Graph, Tensor, Value, clip, concat, for_each_row, mean, where
 from .inputs import Inputs
 from .layers import block_mean, limited, shuffle, silu, unshuffle
 from .model_directory import ModelDirectory
@@ -64,11 +64,12 @@ class DepthNetwork(FlowLayers):
         level = mean(frames[0], [1, 2, 3])
         spread = np.maximum(np.sqrt(mean((frames[0] - level) * (frames[0] - level), [1, 2, 3])), _LEAST_SPREAD)
         view = self._view([(frame - level) / spread for frame in frames], camera, inputs)
-        assert inputs.actions is not None
-        actions, state = limited(inputs.actions, self.spec["actions"]), self.scaled_state(inputs.state)
-        motion = Motion(self.spec, self.layers)(actions, inputs.state, state)
+        state = self.scaled_state(inputs.state)
+        actions = None if inputs.actions is None else limited(inputs.actions, self.spec["actions"])
+        motion = None if actions is None else Motion(self.spec, self.layers)(actions, inputs.state, state)
         modulation = self.modulation(range(self.horizon), state, actions, motion, view.frame)
-        drawn, z = self._steps(view, motion.reshape(-1, 3, 1, 1), modulation)
+        moved = for_each_row(np.zeros((1, self.horizon, 3)), view.frame) if motion is None else motion
+        drawn, z = self._steps(view, moved.reshape(-1, 3, 1, 1), modulation)
         drawn = drawn.reshape(-1, self.horizon, *self.shape)
         self.frames_output(graph, clip(drawn * spread + level, 0, 1))
         graph.output("depth", view.depth.reshape(-1, *self.shape), ["batch", *self.shape], "of the last frame, in metres")
@@ -97,14 +98,13 @@ class DepthNetwork(FlowLayers):
 
     def _motion_back(self, inputs: Inputs, back: int) -> tuple[Turn, Value, Value]:
         """Where the camera stood at an earlier frame, as seen from the last one: turn, ahead, left."""
-        assert inputs.states is not None and inputs.state is not None
         back = min(back, int(self.spec["context"]) - 1)
-        if self.pose_channels:
+        if inputs.states is not None and self.pose_channels:
             here, there = (pose_in(inputs.states[:, -1 - frame], self.pose_channels) for frame in (0, back))
             turned = Vector(there.x - here.x, there.y - here.y, 0.0).turned(here.heading.back())
             return there.heading.then(here.heading.back()), turned.ahead, turned.left
         speeds = [channel for channel in speed_channels(self.states) if channel is not None]
-        if len(speeds) < 2:
+        if inputs.state is None or len(speeds) < 2:
             return Turn(1.0, 0.0), 0.0, 0.0
         forward, rate = (inputs.state[:, channel : channel + 1].reshape(-1, 1, 1, 1) for channel in speeds)
         time = -self.spec["frame_period_s"] * back
