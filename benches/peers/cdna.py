@@ -1,9 +1,10 @@
 """CDNA as a graph of ONNX, with random weights.
 
-Finn, Goodfellow & Levine, "Unsupervised Learning for Physical Interaction through Video Prediction", NIPS 2016, figure 1; skips and
-kernel sizes as in the program that its authors released: seven convolutional LSTMs of 32, 32, 64, 64, 128, 64 and 32 channels with
-5×5 kernels, ten 5×5 kernels that move the last frame's pixels, a generated picture, and eleven masks. Frames are gray, 64×64 px. Its
-normalization layers and its prediction of the next state are left out, so it takes longer than measured here.
+Finn, Goodfellow & Levine, "Unsupervised Learning for Physical Interaction through Video Prediction", NIPS 2016, figure 1; skips
+and kernel sizes as in the program that its authors released: seven convolutional LSTMs of 32, 32, 64, 64, 128, 64 and 32 channels
+with 5×5 kernels, ten 5×5 kernels that move the last frame's pixels, a generated picture, and eleven masks. Frames are gray, 64×64
+px. Its normalization layers and its prediction of the next state are left out, so it takes longer than measured here. 8.31 million
+parameters.
 """
 
 from __future__ import annotations

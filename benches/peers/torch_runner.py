@@ -61,7 +61,7 @@ def _expand(x: torch.Tensor, shape: list[int]) -> torch.Tensor:
 
 
 #: The operands that are shapes and places, by operator: lists of whole numbers.
-_NUMBERS = {"Slice": (1, 2, 3, 4), "Squeeze": (1,), "Unsqueeze": (1,), "Reshape": (1,), "Expand": (1,), "Pad": (1,), "ReduceSum": (1,)}
+_NUMBERS = {"Slice": (1, 2, 3, 4)} | dict.fromkeys(["Squeeze", "Unsqueeze", "Reshape", "Expand", "Pad", "ReduceSum"], (1,))
 
 _OPERATORS: dict[str, Callable[..., Any]] = {
     "Add": torch.add, "Sub": torch.sub, "Mul": torch.mul, "Div": torch.div, "MatMul": torch.matmul, "Neg": torch.neg,
