@@ -94,7 +94,7 @@ class FlowLayers:
         """The frame of a state: pixels of the last frame, moved in two ways, and content, mixed."""
         layers, moved = self.layers, self.sampled(last, room)
         enlarged = shuffle(layers.at_each_place(silu(z), "flow.enlarge"))
-        share = block_mean(where_inside(room.outside(self.shape), last))
+        share = block_mean(inside(room.outside(self.shape), last))
         fine = silu(layers.conv3(concat([enlarged, unshuffle(moved), share, beside]), "flow.fine"))
         head = shuffle(layers.conv3(fine, "flow.head"))
         part = [head[:, index : index + 1] for index in range(8)]
@@ -118,8 +118,8 @@ class FlowLayers:
         return where(places.is_near(self.quarter, -1, 0), sample(coarse, places, self.quarter), 0.0)
 
 
-def where_inside(outside: Value, like: Tensor) -> Tensor:
-    """1 where a place is inside the frame, 0 elsewhere."""
+def inside(outside: Value, like: Tensor) -> Tensor:
+    """1 where the distance to the frame is 0, else 0."""
     if isinstance(outside, Tensor):
         return where(outside <= 0, 1.0, 0.0)
     return for_each_row((outside <= 0).astype(np.float32), like)
@@ -127,13 +127,7 @@ def where_inside(outside: Value, like: Tensor) -> Tensor:
 
 def quarter_places(places: Place) -> Place:
     """The places of the quarter grid: the mean of the four middle pixels of each 4×4 block."""
-
-    def middle(at: Value) -> Value:
-        if isinstance(at, Tensor):
-            return (block_mean(at[:, :, 1:-1, 1:-1], stride=4) - 1.5) / 4
-        return (at[:, :, 1::4, 1::4] + at[:, :, 2::4, 2::4] - 3) / 8
-
-    return Place(middle(places.column), middle(places.row))
+    return Place(*((block_mean(at[:, :, 1:-1, 1:-1], stride=4) - 1.5) / 4 for at in places))
 
 
 class _Window(NamedTuple):

@@ -109,9 +109,11 @@ class Graph:
         return self._known[key]
 
     def _constant(self, value: Any) -> Tensor:
-        array = np.ascontiguousarray(value) if np.ndim(value) else np.array(value)
-        array = array.astype(np.float32) if array.dtype.kind == "f" else array
-        if array.dtype.kind == "i" and array.ndim == 0:
+        array = np.asarray(value)
+        # Whole numbers in an array are a shape, axes or indices. All other numbers are values.
+        if array.dtype.kind == "i" and array.ndim:
+            array = array.astype(np.int64)
+        elif array.dtype.kind in "if":
             array = array.astype(np.float32)
         key = (array.dtype.str, array.shape, array.tobytes())
         if key not in self._known:
