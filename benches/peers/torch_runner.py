@@ -107,7 +107,7 @@ class TorchModel:
     def _joins_shapes(self, node: onnx.NodeProto) -> bool:
         return node.input[0].startswith("Shape")
 
-    @torch.inference_mode()
+    @torch.no_grad()
     def __call__(self, inputs: dict[str, torch.Tensor]) -> list[torch.Tensor]:
         values: dict[str, Any] = {**self.constants, **inputs}
         for operator, names, options, name in self.steps:
