@@ -33,7 +33,7 @@ class Case:
     bench: str | None = None
 
     def inputs(self) -> dict[str, NDArray[np.float32]]:
-        """Random frames; conditioning at its mean would be 0 after scaling, so small random numbers."""
+        """Random frames, and small random numbers as states and actions."""
         random = np.random.default_rng(1)
         given = {}
         for value in self.model.graph.input:
