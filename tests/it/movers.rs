@@ -104,6 +104,11 @@ fn a_network_learns_where_movers_are_and_will_be() {
     let more = dir.path().join("more");
     train(&config(&["sequence.steps=4"]), &dataset, &more, Some(&weights)).unwrap();
     assert!(predicted(&more, &dataset, 4).movers.is_some());
+    // To a model without movers, what finds them is left out.
+    let weights = registry::load_weights(&more.join("model")).unwrap();
+    let fewer = dir.path().join("fewer");
+    train(&config(&settings), &dataset, &fewer, Some(&weights)).unwrap();
+    assert!(predicted(&fewer, &dataset, 4).movers.is_none());
 }
 
 #[test]

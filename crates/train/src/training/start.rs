@@ -10,7 +10,8 @@ use foreframe_core::types::Seed;
 /// Prefix of the names of the tensors that find movers.
 const MOVERS_PREFIX: &str = "flow.movers.";
 
-/// The weights of another model; if only this training's network finds movers, what finds them starts at random. Errors:
+/// The weights of another model; if only this training's network finds movers, what finds them starts at random, and if only
+/// the other one does, that is left out. Errors:
 /// `OtherNetwork` if they do not fit this training's network, `OtherUnits`.
 pub(super) fn parameters(plan: &TrainingPlan<'_>, start: &StoredWeights, seed: Seed) -> Result<Parameters, TrainError> {
     let (from, to) = (&start.manifest.spec, &plan.spec);
@@ -39,12 +40,13 @@ pub(super) fn parameters(plan: &TrainingPlan<'_>, start: &StoredWeights, seed: S
     }
     let mut tensors = start.parameters.snapshot()?;
     if let (Some(from), Some(to)) = (from.flow(), to.flow())
-        && to.layers.movers
-        && !from.layers.movers
+        && to.layers.movers != from.layers.movers
     {
-        // What finds movers is new.
-        let initial = Parameters::initialize(&plan.spec, seed)?.snapshot()?;
-        tensors.extend(initial.into_iter().filter(|(name, _)| name.starts_with(MOVERS_PREFIX)));
+        tensors.retain(|name, _| !name.starts_with(MOVERS_PREFIX));
+        if to.layers.movers {
+            let initial = Parameters::initialize(&plan.spec, seed)?.snapshot()?;
+            tensors.extend(initial.into_iter().filter(|(name, _)| name.starts_with(MOVERS_PREFIX)));
+        }
     }
     Parameters::from_tensors(&plan.spec, tensors).map_err(|source| TrainError::OtherNetwork {
         model: start.manifest.name.clone(),
