@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 CONTEXT = HORIZON = 5
 #: Of a predicted frame, as crates/core/src/nn/costs.rs counts them.
 CONV_LSTM_MULTIPLY_ADDS, CDNA_MULTIPLY_ADDS = 1941e6, 3165e6
+CONV_LSTM_PARAMETERS, CDNA_PARAMETERS = 7_585_296, 8_309_126
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,10 +62,11 @@ def all_cases(models: Path) -> list[Case]:
         for batch in batches:
             bench = "flow prediction of 64 windows" if batch == 64 else benches.get((name, batch))
             found.append(Case(f"`{name}`, {batch} window{'s' * (batch > 1)}", model, batch, products * batch, bench))
-    for title, (model, _), products in (
-        ("ConvLSTM", conv_lstm(CONTEXT, HORIZON), CONV_LSTM_MULTIPLY_ADDS),
-        ("CDNA", cdna(CONTEXT, HORIZON), CDNA_MULTIPLY_ADDS),
+    for title, (model, parameters), published, products in (
+        ("ConvLSTM", conv_lstm(CONTEXT, HORIZON), CONV_LSTM_PARAMETERS, CONV_LSTM_MULTIPLY_ADDS),
+        ("CDNA", cdna(CONTEXT, HORIZON), CDNA_PARAMETERS, CDNA_MULTIPLY_ADDS),
     ):
+        assert parameters == published, f"{title} has {parameters} parameters"
         found.append(Case(f"{title}, 1 window", model, 1, HORIZON * products))
     return found
 

@@ -61,17 +61,18 @@ class _Network:
             return np.maximum(node("ConvTranspose", x, *layer, strides=[2, 2], pads=[1, 1, 1, 1], output_padding=[1, 1]), 0)
 
         entered = halved(frame, self.enter)
-        half = halved(self.lstm[1].step(self.lstm[0].step(entered)), self.shrink[0])
-        quarter = halved(self.lstm[3].step(self.lstm[2].step(half)), self.shrink[1])
+        at_quarter = halved(self.lstm[1].step(self.lstm[0].step(entered)), self.shrink[0])
+        at_eighth = halved(self.lstm[3].step(self.lstm[2].step(at_quarter)), self.shrink[1])
         everywhere = known + np.zeros((1, 1, SIDE // 8, SIDE // 8))
-        hidden = self.lstm[4].step(np.maximum(node("Conv", concat([quarter, everywhere]), *self.known), 0))
+        hidden = self.lstm[4].step(np.maximum(node("Conv", concat([at_eighth, everywhere]), *self.known), 0))
         x = self.lstm[5].step(doubled(hidden, self.enlarge[0]))
-        x = self.lstm[6].step(doubled(concat([x, half]), self.enlarge[1]))
+        x = self.lstm[6].step(doubled(concat([x, at_quarter]), self.enlarge[1]))
         x = doubled(concat([x, entered]), self.enlarge[2])
         generated = sigmoid(node("Conv", x, *self.generated))
         masks = node("Softmax", node("Conv", x, *self.masks), axis=1)
         kernels = np.maximum(node("Conv", hidden, *self.kernels).reshape(-1, MOVED, KERNEL * KERNEL), 0) + 1e-12
         moved = self._moved(frame, kernels / total(kernels, 2))
+        # Eleven masks: the frame, the generated picture and nine of the ten moved pictures, as in the authors' program.
         return total(masks * concat([frame, generated, moved[:, : MASKS - 2]]), 1)
 
     def _moved(self, frame: Tensor, kernels: Tensor) -> Tensor:

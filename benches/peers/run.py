@@ -45,6 +45,11 @@ def main() -> None:
         for name, runner in others.items()
         if runner is not None
     }
+    for case in all_cases:
+        # What is timed computes the same.
+        outputs = [call() for (of, _), call in calls.items() if of is case]
+        if any(runners.difference(outputs[0], other) > 1e-3 for other in outputs[1:]):
+            raise SystemExit(f"{case.title}: PyTorch and onnxruntime predict different frames")
     products = runners.products()
     times: dict[tuple[cases.Case, str], list[float]] = {}
     rates: dict[str, list[float]] = {}
@@ -53,6 +58,8 @@ def main() -> None:
         measured = ours.round()
         for case in all_cases:
             if case.bench is not None:
+                if case.bench not in measured:
+                    raise SystemExit(f"the benches print no line `{case.bench}`; build them again from this tree")
                 times.setdefault((case, "Foreframe"), []).append(measured[case.bench])
             for name in others:
                 if (case, name) in calls:
@@ -67,7 +74,7 @@ def report(all_cases: list[cases.Case], times: dict[tuple[cases.Case, str], list
     peak = max(median(found) for found in rates.values())
     print(", ".join(f"{name} {median(found):.0f} GFLOP/s" for name, found in rates.items()), "in a product of matrices")
     print(f"the peak, of which shares are given: {peak:.0f} GFLOP/s\n")
-    print("| Milliseconds |", " | ".join(COLUMNS), "| onnxruntime / Foreframe | PyTorch / Foreframe | Share of the peak |")
+    print("| Milliseconds |", " | ".join(COLUMNS), "| onnxruntime / Foreframe | PyTorch / Foreframe | Share of the peak, each |")
     print("| --- |" + " ---: |" * (len(COLUMNS) + 3))
     for case in all_cases:
         found = {name: median(times[case, name]) for name in COLUMNS if (case, name) in times}

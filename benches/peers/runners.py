@@ -1,4 +1,4 @@
-"""Those who compute: Foreframe's benches as programs, onnxruntime and PyTorch as calls."""
+"""What computes: Foreframe's benches as programs, onnxruntime and PyTorch as calls."""
 
 from __future__ import annotations
 
@@ -81,6 +81,12 @@ def torch_runner() -> Callable[[onnx.ModelProto, Inputs], Call] | None:
     return runner
 
 
+def difference(outputs: object, others: object) -> float:
+    """The largest difference of the first outputs of two runners."""
+    first, other = (np.asarray(given[0]) for given in (outputs, others))  # type: ignore[index]
+    return float(np.abs(first - other).max())
+
+
 def products() -> dict[str, Call]:
     """A product of two large matrices in single precision, by each library."""
     a, b = np.random.default_rng(1).random((2, _SIDE, _SIDE)).astype(np.float32)
@@ -97,7 +103,7 @@ def product_gflops(product: Call) -> float:
 
 
 def milliseconds(call: Call) -> float:
-    """Of a call: the mean of as many as fit into the least time."""
+    """Mean time of a call, over at least 0.4 s."""
     call()
     started, count = time.perf_counter(), 0
     while (elapsed := time.perf_counter() - started) < LEAST_S:

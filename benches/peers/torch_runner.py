@@ -81,6 +81,10 @@ _OPERATORS: dict[str, Callable[..., Any]] = {
 }  # fmt: skip
 
 
+def _joins_shapes(node: onnx.NodeProto) -> bool:
+    return node.input[0].startswith("Shape")
+
+
 class TorchModel:
     """Runs a model; inputs by name, outputs in their order."""
 
@@ -94,7 +98,7 @@ class TorchModel:
             options = {name: value.decode() if isinstance(value, bytes) else value for name, value in options.items()}
             if node.op_type == "Softmax":
                 options["dim"] = options.pop("axis")
-            if node.op_type == "Concat" and self._joins_shapes(node):
+            if node.op_type == "Concat" and _joins_shapes(node):
                 self.steps.append((lambda rows, ones, axis: [*rows, *ones], list(node.input), options, node.output[0]))
                 self.constants[node.input[1]] = _whole(self.constants[node.input[1]])
                 continue
@@ -103,9 +107,6 @@ class TorchModel:
                 if isinstance(self.constants.get(name), torch.Tensor):
                     self.constants[name] = _whole(self.constants[name])
             self.steps.append((_OPERATORS[node.op_type], list(node.input), options, node.output[0]))
-
-    def _joins_shapes(self, node: onnx.NodeProto) -> bool:
-        return node.input[0].startswith("Shape")
 
     @torch.no_grad()
     def __call__(self, inputs: dict[str, torch.Tensor]) -> list[torch.Tensor]:

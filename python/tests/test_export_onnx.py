@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import re
 import shutil
 import struct
 import subprocess
@@ -26,7 +27,7 @@ NAMES = sorted(path.parent.name for path in MODELS.glob("*/manifest.json"))
 DENSE, FLOW = ["moving", "static"], ["moving-flow", "rooms"]
 #: Of full scale. Sums are in another order, and NumPy computes places in float64.
 TOLERANCE = 1e-5
-#: At sharp edges, a place that is a little elsewhere is another depth, and so another place.
+#: At sharp edges, rounding moves a place and so changes the depth found there.
 DEPTH_TOLERANCE = 5e-5
 
 Window = dict[str, np.ndarray]
@@ -209,11 +210,46 @@ def test_what_cannot_be_exported_is_named(tmp_path: Path) -> None:
         export_onnx(tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("field", "value", "sentence"),
+    [
+        ("context", "5", "spec.context is '5'; it must be of the type int"),
+        ("states", None, "spec.states is None"),
+        ("features", 100, "do not have the shapes that manifest.json states"),
+    ],
+)
+def test_a_damaged_specification_is_named(tmp_path: Path, field: str, value: Any, sentence: str) -> None:
+    manifest, tensors = numpy_networks().read_model(MODELS / "moving")
+    manifest["spec"][field] = value
+    write_model(tmp_path, manifest, tensors)
+    with pytest.raises(UnsupportedModel, match=re.escape(sentence)):
+        export_onnx(tmp_path)
+
+
+def test_a_flow_network_without_a_size_is_named(tmp_path: Path) -> None:
+    manifest, tensors = numpy_networks().read_model(MODELS / "moving-flow")
+    del manifest["spec"]["flow"]["channels"]
+    write_model(tmp_path, manifest, tensors)
+    with pytest.raises(UnsupportedModel, match="has no field 'channels'"):
+        export_onnx(tmp_path)
+
+
+@pytest.mark.parametrize("text", ["3", "[]", '{"name": "a"}', "{", '{"spec": [], "name": "a"}'])
+def test_what_is_no_manifest_is_named(tmp_path: Path, text: str) -> None:
+    shutil.copy(MODELS / "static" / "model.safetensors", tmp_path)
+    (tmp_path / "manifest.json").write_text(text)
+    with pytest.raises(UnsupportedModel, match="not a manifest of Foreframe|is not JSON"):
+        export_onnx(tmp_path)
+
+
 def test_the_command_writes_the_file_and_says_what_it_takes(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "foreframe.export_onnx"]
     done = subprocess.run([*command, MODELS / "moving", tmp_path / "moving.onnx"], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert "takes frames [batch, 5, 64, 64]" in done.stdout and "gives predicted [batch, 5, 64, 64]" in done.stdout
     assert onnxruntime.InferenceSession(tmp_path / "moving.onnx").get_modelmeta().graph_name == "moving"
+    absent = tmp_path / "absent" / "x.onnx"
+    unwritten = subprocess.run([*command, MODELS / "moving", absent], capture_output=True, text=True)
+    assert unwritten.returncode == 1 and "absent" in unwritten.stderr and unwritten.stderr.count("\n") == 1
     failed = subprocess.run([*command, tmp_path, tmp_path / "x.onnx"], capture_output=True, text=True)
     assert failed.returncode == 1 and failed.stderr.startswith("error: ") and not (tmp_path / "x.onnx").exists()

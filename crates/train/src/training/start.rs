@@ -11,8 +11,8 @@ use foreframe_core::types::Seed;
 const MOVERS_PREFIX: &str = "flow.movers.";
 
 /// The weights of another model; if only this training's network finds movers, what finds them starts at random, and if only
-/// the other one does, that is left out. Errors:
-/// `OtherNetwork` if they do not fit this training's network, `OtherUnits`.
+/// the other one does, that is left out.
+/// Errors: `OtherNetwork` if they do not fit this training's network, `OtherUnits`.
 pub(super) fn parameters(plan: &TrainingPlan<'_>, start: &StoredWeights, seed: Seed) -> Result<Parameters, TrainError> {
     let (from, to) = (&start.manifest.spec, &plan.spec);
     let used = [

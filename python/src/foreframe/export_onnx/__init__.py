@@ -10,6 +10,8 @@ import os
 from pathlib import Path
 
 import onnx
+from onnx.checker import ValidationError
+from onnx.shape_inference import InferenceError
 
 from .dense import DenseNetwork
 from .depth import DepthNetwork
@@ -24,9 +26,20 @@ def export_onnx(directory: str | os.PathLike[str], step: bool = False) -> onnx.M
     """The network of a model's directory (manifest.json and model.safetensors) as a graph of ONNX in single precision.
 
     It takes windows: frames ``[batch, context, height, width]`` from 0 to 1, and the states and actions of the manifest in
-    their own units. With ``step``, a dense network takes one frame and the features of those before it instead.
+    their own units. With ``step``, a dense network takes one frame and the features of those before it instead. Raises
+    :class:`UnsupportedModel`, a ``ValueError``, where the directory holds no such model.
     """
     model = ModelDirectory(Path(directory))
+    try:
+        return _graph(model, step)
+    except KeyError as error:
+        raise UnsupportedModel(f"the specification in {directory}/manifest.json has no field {error}") from error
+    except (InferenceError, ValidationError) as error:
+        message = f"the tensors in {directory}/model.safetensors do not have the shapes that manifest.json states"
+        raise UnsupportedModel(f"{message}: {str(error).splitlines()[0]}") from error
+
+
+def _graph(model: ModelDirectory, step: bool) -> onnx.ModelProto:
     network = _network(model)
     graph = Graph()
     if not step:

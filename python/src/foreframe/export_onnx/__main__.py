@@ -6,9 +6,10 @@ import argparse
 import sys
 from pathlib import Path
 
-import onnx
-
-from . import UnsupportedModel, export_onnx
+try:
+    from . import UnsupportedModel, export_onnx
+except ModuleNotFoundError as error:
+    sys.exit(f"error: {error}; install the package with its extra, foreframe[onnx]")
 
 
 def main() -> int:
@@ -19,7 +20,7 @@ def main() -> int:
     arguments = parser.parse_args()
     try:
         model = export_onnx(arguments.model, step=arguments.step)
-        onnx.save(model, arguments.out)
+        arguments.out.write_bytes(model.SerializeToString())
     except (UnsupportedModel, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1

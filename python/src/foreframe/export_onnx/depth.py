@@ -49,7 +49,7 @@ class _View(NamedTuple):
 
 
 class DepthNetwork(FlowLayers):
-    """Frames are counted from the last one's mean in its spread."""
+    """Frames are normalized with the last frame's mean and standard deviation."""
 
     def __init__(self, model: ModelDirectory) -> None:
         super().__init__(model)

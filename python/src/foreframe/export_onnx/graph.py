@@ -41,7 +41,6 @@ _OPERATORS: Mapping[np.ufunc, str] = {
     np.less_equal: "LessOrEqual",
     np.greater: "Greater",
     np.greater_equal: "GreaterOrEqual",
-    np.equal: "Equal",
     np.bitwise_and: "And",
     np.bitwise_or: "Or",
     np.invert: "Not",
@@ -79,7 +78,7 @@ class Tensor(np.lib.mixins.NDArrayOperatorsMixin):
 
 
 class Graph:
-    """Nodes, inputs and outputs. A node with the operands and attributes of an earlier one is that one."""
+    """Nodes, inputs and outputs. Identical nodes are shared."""
 
     def __init__(self) -> None:
         self._nodes: list[onnx.NodeProto] = []
@@ -147,7 +146,7 @@ def for_each_row(constant: Array, like: Tensor) -> Tensor:
 
 
 def repeated(x: Tensor, count: int, shape: Sequence[int]) -> Tensor:
-    """Each row of ``[rows, *shape]`` as often in a row: ``[rows · count, *shape]``."""
+    """Repeats each row of ``[rows, *shape]`` ``count`` times: ``[rows · count, *shape]``."""
     row = x.graph.node("Unsqueeze", x, np.array([1]))
     return x.graph.node("Expand", row, np.array([1, count, *(1 for _ in shape)])).reshape(-1, *shape)
 
