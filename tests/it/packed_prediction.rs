@@ -54,7 +54,14 @@ fn packed_weights_predict_what_the_tensors_predict() {
         let [packed, expected] =
             [&packed, &on_tensors].map(|network| network.predict_rollouts(&frames, &windows, &plans).unwrap());
         let most = largest_difference(&packed, &expected);
-        assert!(most < 1e-5, "{name}: {most}");
+        // Where depth is estimated, rounding moves a place, and so the depth found there: more where neighbours differ as much as
+        // here.
+        let bound = if spec.flow().is_some_and(|flow| flow.layers.depth) {
+            3e-5
+        } else {
+            1e-5
+        };
+        assert!(most < bound, "{name}: {most}");
     }
 }
 

@@ -60,7 +60,8 @@ impl Network {
     }
 
     /// The same network with its weights packed as they are now, for faster predictions; it sees no update of the parameters.
-    /// Predictions differ by less than 1e-5. The dense network stays as it is. Errors: `Tensor`.
+    /// Predictions differ by less than 1e-5 of full scale, by less than 3e-5 where depth is estimated, at sharp edges. The dense
+    /// network stays as it is. Errors: `Tensor`.
     pub fn packed(mut self) -> Result<Self, NnError> {
         if let AnyNetwork::Flow(flow) = &mut self.network {
             flow.pack()?;
