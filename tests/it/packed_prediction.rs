@@ -54,8 +54,7 @@ fn packed_weights_predict_what_the_tensors_predict() {
         let [packed, expected] =
             [&packed, &on_tensors].map(|network| network.predict_rollouts(&frames, &windows, &plans).unwrap());
         let most = largest_difference(&packed, &expected);
-        // Where depth is estimated, rounding moves a place, and so the depth found there: more where neighbours differ as much as
-        // here.
+        // Where depth is estimated, rounding moves a place, and so changes the depth found there; most in frames of noise.
         let bound = if spec.flow().is_some_and(|flow| flow.layers.depth) {
             3e-5
         } else {

@@ -16,7 +16,6 @@ _DTYPES: dict[str, type[np.floating[Any]]] = {"F16": np.float16, "F32": np.float
 _FIELDS: dict[str, type] = {
     "frame_width_px": int,
     "frame_height_px": int,
-    "frame_period_s": float,
     "preprocess": dict,
     "context": int,
     "horizon": int,
