@@ -20,8 +20,9 @@ use foreframe_train::evaluation::figures::episode_animation::episode_gif;
 ///
 /// The drivers: pid drives straight to the goal and sees nothing; stop does the same, but stands while the model sees something on
 /// its way; plan follows the plan that the model finds, anew at every frame; velocity does the same, but expects movers to go on as
-/// fast as in the last frames; places also knows where all robots are, seen or not; simulator plans with the simulator itself as the
-/// model, the upper limit. Goals can be reached on a straight line, but for the other robots. All drivers know where the goal is. The
+/// fast as they went, and remembers for 2.5 s those that left the picture; visible does so from the true places of the robots in the
+/// picture, without memory; places from the true places of all robots; simulator plans with the simulator itself as the model, the
+/// upper limit. Goals can be reached on a straight line, but for the other robots. All drivers know where the goal is. The
 /// table has means over the episodes with 95 % bootstrap intervals. Of the collisions, (standing) are those in which the robot stood or
 /// turned on the spot, (unseen) those with a robot that its camera had not shown in the two seconds before. Episodes run side by side on all
 /// cores.
@@ -48,16 +49,16 @@ pub(super) struct DriveArgs {
     /// The same seed gives the same episodes and goals
     #[arg(long, default_value_t = 0)]
     seed: u64,
-    /// The drivers: pid, stop, velocity, places, plan, simulator
+    /// The drivers: pid, stop, velocity, visible, places, plan, simulator
     #[arg(long = "driver", value_delimiter = ',', required = true)]
     drivers: Vec<DriverKind>,
-    /// For the drivers stop, velocity, places and plan: the directory of a model, its name, or NAME@VERSION
+    /// For the drivers stop, velocity, visible, places and plan: the directory of a model, its name, or NAME@VERSION
     #[arg(long)]
     model: Option<String>,
     /// Longest time of an episode, in seconds
     #[arg(long, value_name = "S", default_value_t = 20.0)]
     duration: f64,
-    /// The time for each plan of the drivers velocity, places and plan, in milliseconds; without it, searches are whole, and a drive can be repeated
+    /// The time for each plan of the drivers velocity, visible, places and plan, in milliseconds; without it, searches are whole, and a drive can be repeated
     #[arg(long, value_name = "MS", value_parser = clap::value_parser!(u64).range(1..=10_000))]
     budget_ms: Option<u64>,
     /// Print the scores and all episodes as JSON

@@ -6,7 +6,7 @@ use super::error::DriveError;
 use super::settings::DriverKind;
 use super::simulated::best_commands;
 use super::situation::{LIMITS, MARGIN_M, Situation, action, in_room};
-use super::tracks::MoverTracks;
+use super::tracks::{MoverTracks, Viewpoint};
 use foreframe_core::planning::{Goal, Obstacles, PlanSettings, PlannerInput, SolverSettings, plan_around};
 use foreframe_core::registry::Model;
 use foreframe_core::types::{Action, Seed};
@@ -68,7 +68,9 @@ impl<'a> EpisodeDriver<'a> {
     pub(super) fn command(&mut self, now: &Situation<'_>) -> Result<[f32; 2], DriveError> {
         match (self.kind, self.model) {
             (DriverKind::Stop, Some(model)) => self.stop_and_go(model, now),
-            (DriverKind::Plan | DriverKind::Velocity | DriverKind::Places, Some(model)) => self.planned(model, now),
+            (DriverKind::Plan | DriverKind::Velocity | DriverKind::Visible | DriverKind::Places, Some(model)) => {
+                self.planned(model, now)
+            }
             (DriverKind::Simulator, _) => self.simulated(now),
             _ => Ok(self.straight(now)),
         }
@@ -134,10 +136,21 @@ impl<'a> EpisodeDriver<'a> {
         };
         let (tracks, pose) = (&mut self.tracks, now.world.observer_pose());
         let kind = self.kind;
-        let choice = plan_around(model, &now.context(model)?, input, &mut |occupancy| match kind {
-            DriverKind::Velocity => tracks.extrapolate(&mut occupancy.movers, pose),
-            DriverKind::Places => tracks.extrapolate_true(&mut occupancy.movers, now.world),
-            _ => {}
+        let viewpoint = Viewpoint {
+            pose,
+            view_rad: now.camera.horizontal_fov_rad / 2.0,
+            period_s: self.period_s,
+        };
+        let choice = plan_around(model, &now.context(model)?, input, &mut |occupancy| {
+            let movers = &mut occupancy.movers;
+            match kind {
+                DriverKind::Velocity => tracks.extrapolate(movers, viewpoint),
+                DriverKind::Visible => {
+                    tracks.extrapolate_true(movers, now.world, &|robot| now.views.saw(robot + 1, now.frame, 0))
+                }
+                DriverKind::Places => tracks.extrapolate_true(movers, now.world, &|_| true),
+                _ => {}
+            }
         })?;
         let way = choice.best.motion.unwrap_or_default();
         self.way_m = way

@@ -1,6 +1,6 @@
 //! One episode with one driver.
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::VecDeque;
 use std::f32::consts::PI;
 use std::time::Instant;
 
@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 use super::drivers::EpisodeDriver;
 use super::error::DriveError;
 use super::settings::{DriveSettings, DriverKind};
-use super::situation::{Situation, seen_from};
+use super::situation::{RobotViews, Situation, seen_from};
 use foreframe_core::frame::warp::CameraModel;
 use foreframe_core::registry::Model;
 use foreframe_core::types::Action;
@@ -23,9 +23,8 @@ const LEAST_GOAL_M: f32 = 1.5;
 const CROSSED_RAD: f32 = 0.35;
 /// Without a model, the robot stands for this many frames, as others stand until their model's context is full.
 const CONTEXT: usize = 5;
-/// A robot counts as seen for so long after the camera showed that many of its pixels, in seconds.
+/// A robot counts as seen for so long after the camera showed it, in seconds.
 const SEEN_S: f32 = 2.0;
-const SEEN_PIXELS: usize = 6;
 /// Commands below this are standing, in m/s.
 const STANDING_M_S: f32 = 0.02;
 
@@ -183,10 +182,7 @@ pub(super) fn drive(
     };
     let mut result = EpisodeResult::at_start(distance(&world, goal), world.gap_m());
     let (mut frames, mut states) = (VecDeque::new(), VecDeque::new());
-    let mut views = RobotViews {
-        recent: (SEEN_S / period_s).round() as u64,
-        last: BTreeMap::new(),
-    };
+    let (mut views, recent) = (RobotViews::default(), (SEEN_S / period_s).round() as u64);
     let (mut was_touching, mut was_moving) = (false, false);
     for frame in 0.. {
         let observation = world.observe();
@@ -206,6 +202,7 @@ pub(super) fn drive(
                 camera,
                 goal_m: seen_from(world.observer_pose(), goal),
                 frame,
+                views: &views,
             };
             let begun = Instant::now();
             command = driver.command(&now)?;
@@ -223,7 +220,7 @@ pub(super) fn drive(
         result.closest_m = result.closest_m.min(f64::from(world.gap_m()));
         let touch = world.touch();
         if let Some(touch) = touch.filter(|_| !was_touching) {
-            result.count(touch, touch.robot.is_some_and(|robot| !views.saw(robot, frame)));
+            result.count(touch, touch.robot.is_some_and(|robot| !views.saw(robot, frame, recent)));
         }
         was_touching = touch.is_some();
         result.time_s = step.observation.time_s;
@@ -234,30 +231,6 @@ pub(super) fn drive(
     }
     show(&world, &[])?;
     Ok(result)
-}
-
-/// When the camera showed each of the other robots last.
-struct RobotViews {
-    /// Frames that count as just now.
-    recent: u64,
-    last: BTreeMap<u8, u64>,
-}
-
-impl RobotViews {
-    /// `mask`: the robot of each pixel.
-    fn record(&mut self, mask: &[u8], frame: u64) {
-        let mut pixels = BTreeMap::new();
-        for &robot in mask.iter().filter(|&&robot| robot > 0) {
-            *pixels.entry(robot).or_insert(0) += 1;
-        }
-        let shown = pixels.into_iter().filter(|&(_, count)| count >= SEEN_PIXELS);
-        self.last.extend(shown.map(|(robot, _)| (robot, frame)));
-    }
-
-    fn saw(&self, robot: usize, frame: u64) -> bool {
-        let last = u8::try_from(robot).ok().and_then(|robot| self.last.get(&robot));
-        last.is_some_and(|&last| frame - last <= self.recent)
-    }
 }
 
 fn distance(world: &World, [x, y]: [f32; 2]) -> f32 {

@@ -18,9 +18,12 @@ pub enum DriverKind {
     Pid,
     /// As `pid`, but stands while the model's depth network sees something on its way within the next second.
     Stop,
-    /// As `plan`, but movers are expected to go on as fast as in the last frames, instead of as the model predicts.
+    /// As `plan`, but movers are expected to go on as fast as in the last frames, instead of as the model predicts. Those that
+    /// have left the picture are remembered.
     Velocity,
-    /// As `velocity`, but knows where every robot is now, also those that the camera does not show.
+    /// As `velocity`, but knows where the robots are that the camera shows now, and does not remember others.
+    Visible,
+    /// As `visible`, but knows where every robot is, also those that the camera does not show.
     Places,
     /// Follows the plan that the model finds, and plans anew at every frame.
     Plan,
@@ -30,10 +33,11 @@ pub enum DriverKind {
 
 impl DriverKind {
     /// All drivers.
-    pub const ALL: [Self; 6] = [
+    pub const ALL: [Self; 7] = [
         Self::Pid,
         Self::Stop,
         Self::Velocity,
+        Self::Visible,
         Self::Places,
         Self::Plan,
         Self::Simulator,
@@ -46,6 +50,7 @@ impl DriverKind {
             Self::Pid => "pid",
             Self::Stop => "stop",
             Self::Velocity => "velocity",
+            Self::Visible => "visible",
             Self::Places => "places",
             Self::Plan => "plan",
             Self::Simulator => "simulator",
@@ -59,7 +64,7 @@ impl FromStr for DriverKind {
     fn from_str(name: &str) -> Result<Self, String> {
         let found = Self::ALL.into_iter().find(|driver| driver.name() == name);
         found.ok_or_else(|| {
-            format!("there is no driver {name:?}; there are: pid, stop, velocity, places, plan, simulator")
+            format!("there is no driver {name:?}; there are: pid, stop, velocity, visible, places, plan, simulator")
         })
     }
 }
@@ -127,7 +132,7 @@ impl DriveSettings {
             if !fits {
                 return Err(DriveError::OtherRobot { model: name() });
             }
-            if matches!(driver, DriverKind::Velocity | DriverKind::Places)
+            if matches!(driver, DriverKind::Velocity | DriverKind::Visible | DriverKind::Places)
                 && !spec.flow().is_some_and(|flow| flow.layers.movers)
             {
                 return Err(DriveError::NoMovers {

@@ -1,6 +1,6 @@
 //! What a driver knows at a frame, and what stands in its way.
 
-use std::collections::VecDeque;
+use std::collections::{BTreeMap, VecDeque};
 
 use super::error::DriveError;
 use foreframe_core::frame::Frame;
@@ -28,6 +28,9 @@ pub(super) const LIMITS: [ActionLimit; 2] = [
 /// The distance that planning drivers keep, in metres.
 pub(super) const MARGIN_M: f32 = 0.15;
 
+/// The camera shows a robot if it shows that many of its pixels.
+const SEEN_PIXELS: usize = 6;
+
 /// What a driver knows at a frame.
 pub(super) struct Situation<'a> {
     /// The world, for the driver `simulator`.
@@ -42,6 +45,32 @@ pub(super) struct Situation<'a> {
     pub(super) goal_m: [f32; 2],
     /// The number of the frame.
     pub(super) frame: u64,
+    /// When the camera showed others.
+    pub(super) views: &'a RobotViews,
+}
+
+/// When the camera showed each of the other robots last.
+#[derive(Debug, Default)]
+pub(super) struct RobotViews {
+    last: BTreeMap<u8, u64>,
+}
+
+impl RobotViews {
+    /// `mask`: the robot of each pixel.
+    pub(super) fn record(&mut self, mask: &[u8], frame: u64) {
+        let mut pixels = BTreeMap::new();
+        for &robot in mask.iter().filter(|&&robot| robot > 0) {
+            *pixels.entry(robot).or_insert(0) += 1;
+        }
+        let shown = pixels.into_iter().filter(|&(_, count)| count >= SEEN_PIXELS);
+        self.last.extend(shown.map(|(robot, _)| (robot, frame)));
+    }
+
+    /// Whether the camera showed a robot, by its id in the mask, at that frame or at one of the `recent` frames before it.
+    pub(super) fn saw(&self, robot: usize, frame: u64, recent: u64) -> bool {
+        let last = u8::try_from(robot).ok().and_then(|robot| self.last.get(&robot));
+        last.is_some_and(|&last| frame - last <= recent)
+    }
 }
 
 impl Situation<'_> {
