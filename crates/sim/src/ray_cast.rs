@@ -126,10 +126,11 @@ mod tests {
             to in proptest::array::uniform3(-0.6f32..0.6).prop_map(Vector::from_array),
         ) {
             let ray = Ray::new(from, to - from);
-            let hit = CYLINDER.cast(&ray, 10.0);
+            let hit = CYLINDER.cast(&ray, 2.0);
             if let Some(hit) = hit {
                 let point = ray.point_at(hit.time_of_impact);
                 prop_assert!(is_inside(point, -1e-4) && !is_inside(point, 1e-4), "{point}");
+                prop_assert!((hit.normal.length() - 1.0).abs() < 1e-3, "{}", hit.normal);
                 // A ray that only touches the side may end up behind it by rounding.
                 prop_assert!(hit.normal.dot(ray.dir) < 1e-2, "{} points away", hit.normal);
             }

@@ -41,7 +41,7 @@ pub enum DriveError {
         scenario: Scenario,
     },
     /// No driver.
-    #[error("drivers is empty; name at least one of pid, stop, velocity, places, plan and simulator")]
+    #[error("drivers is empty; name at least one of pid, stop, velocity, visible, places, plan and simulator")]
     NoDriver,
     /// The actions of the model are not those of the robot.
     #[error(

@@ -21,9 +21,9 @@ pub enum DriverKind {
     /// As `plan`, but movers are expected to go on as fast as in the last frames, instead of as the model predicts. Those that
     /// have left the picture are remembered.
     Velocity,
-    /// As `velocity`, but knows where the robots are that the camera shows now, and does not remember others.
+    /// As `velocity`, but knows the true place, size and speed of each robot that the camera shows now, and remembers none.
     Visible,
-    /// As `visible`, but knows where every robot is, also those that the camera does not show.
+    /// As `visible`, but knows that of every robot, also of those that the camera does not show.
     Places,
     /// Follows the plan that the model finds, and plans anew at every frame.
     Plan,
@@ -84,7 +84,7 @@ pub struct DriveSettings {
     pub drivers: Vec<DriverKind>,
     /// Longest time of an episode, in seconds.
     pub duration_s: f64,
-    /// Time for a plan of the driver `plan`; without it, searches are whole, and a drive can be repeated.
+    /// Time for a plan of drivers that use a model; without it, searches are whole, and a drive can be repeated.
     pub budget: Option<Duration>,
 }
 

@@ -33,7 +33,7 @@ const SEEN_PIXELS: usize = 6;
 
 /// What a driver knows at a frame.
 pub(super) struct Situation<'a> {
-    /// The world, for the driver `simulator`.
+    /// The world, for drivers that know more than they see.
     pub(super) world: &'a World,
     /// The frames of the model's context, oldest first.
     pub(super) frames: &'a VecDeque<Frame>,
@@ -104,8 +104,12 @@ pub(super) fn in_room(pose: PlanarPose, [ahead, left]: [f32; 2]) -> [f32; 2] {
 
 /// A place in the room as a robot with that pose has it: metres ahead and to the left.
 pub(super) fn seen_from(pose: PlanarPose, [x, y]: [f32; 2]) -> [f32; 2] {
+    in_axes_of(pose, [x - pose.x_m, y - pose.y_m])
+}
+
+/// A direction of the room as a robot with that pose has it: ahead and to the left.
+pub(super) fn in_axes_of(pose: PlanarPose, [x, y]: [f32; 2]) -> [f32; 2] {
     let (sin, cos) = pose.heading_rad.sin_cos();
-    let (x, y) = (x - pose.x_m, y - pose.y_m);
     [cos * x + sin * y, cos * y - sin * x]
 }
 
