@@ -146,7 +146,7 @@ impl<'a> EpisodeDriver<'a> {
             match kind {
                 DriverKind::Velocity => tracks.extrapolate(movers, viewpoint),
                 DriverKind::Visible => {
-                    tracks.extrapolate_true(movers, now.world, &|robot| now.views.saw(robot + 1, now.frame, 0))
+                    tracks.extrapolate_true(movers, now.world, &|robot| now.views.saw(robot + 1, now.frame, 0));
                 }
                 DriverKind::Places => tracks.extrapolate_true(movers, now.world, &|_| true),
                 _ => {}
