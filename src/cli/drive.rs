@@ -18,11 +18,13 @@ use foreframe_train::evaluation::figures::episode_animation::episode_gif;
 
 /// Let robots drive to goals in the simulator, with several drivers in the same episodes.
 ///
-/// The drivers: pid drives straight to the goal and sees nothing; stop does the same, but stands while the model sees something on
-/// its way; plan follows the plan that the model finds, anew at every frame; velocity does the same, but expects movers to go on as
-/// fast as they went, and remembers for 2.5 s those that left the picture; visible knows the true place and speed of each robot
-/// in the picture, and remembers none; places knows those of all robots; simulator plans with the simulator itself as the model, the
-/// upper limit. Goals can be reached on a straight line, but for the other robots. All drivers know where the goal is. The
+/// The drivers: pid drives straight to the goal and sees nothing. stop does the same, but stands while the model sees something on
+/// its way. plan follows the plan that the model finds, anew at every frame. velocity does the same, but expects movers to go on as
+/// fast as they went, and remembers those that left the picture for 2.5 s. visible plans as velocity, but knows the true place and
+/// speed of each robot in the picture, and remembers none; places knows those of all robots. simulator plans with the simulator
+/// itself as the model: the upper limit.
+///
+/// Goals can be reached on a straight line, but for the other robots. All drivers know where the goal is. The
 /// table has means over the episodes with 95 % bootstrap intervals. Of the collisions, (standing) are those in which the robot stood or
 /// turned on the spot, (unseen) those with a robot that its camera had not shown in the two seconds before. Episodes run side by side on all
 /// cores.

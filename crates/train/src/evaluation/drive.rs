@@ -1,11 +1,12 @@
 //! The closed loop: robots that drive to a goal among others in the simulator, with several drivers, all in the same episodes.
 //!
-//! `error` → `settings` → `situation` (what is known at a frame) → `tracks`, `simulated` → `drivers` (what chooses the commands) → `episode`
+//! `error` → `settings` → `situation` (what is known at a frame) → `tracks` → `known`, `simulated` → `drivers` (what chooses the commands) → `episode`
 //! → `scores`.
 
 mod drivers;
 mod episode;
 mod error;
+mod known;
 mod scores;
 mod settings;
 mod simulated;

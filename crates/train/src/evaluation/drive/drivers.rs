@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use super::error::DriveError;
+use super::known::KnownMovers;
 use super::settings::DriverKind;
 use super::simulated::best_commands;
 use super::situation::{LIMITS, MARGIN_M, Situation, action, in_room};
@@ -31,6 +32,7 @@ pub(super) struct EpisodeDriver<'a> {
     /// The way of the last plan, in the room; empty for drivers that do not plan.
     way_m: Vec<[f32; 2]>,
     tracks: MoverTracks,
+    known: KnownMovers,
 }
 
 impl<'a> EpisodeDriver<'a> {
@@ -56,6 +58,7 @@ impl<'a> EpisodeDriver<'a> {
             present: Vec::new(),
             way_m: Vec::new(),
             tracks: MoverTracks::default(),
+            known: KnownMovers::default(),
         }
     }
 
@@ -134,7 +137,7 @@ impl<'a> EpisodeDriver<'a> {
             present: std::mem::take(&mut self.present),
             before: None,
         };
-        let (tracks, pose) = (&mut self.tracks, now.world.observer_pose());
+        let (tracks, known, pose) = (&mut self.tracks, &mut self.known, now.world.observer_pose());
         let kind = self.kind;
         let viewpoint = Viewpoint {
             pose,
@@ -146,9 +149,9 @@ impl<'a> EpisodeDriver<'a> {
             match kind {
                 DriverKind::Velocity => tracks.extrapolate(movers, viewpoint),
                 DriverKind::Visible => {
-                    tracks.extrapolate_true(movers, now.world, &|robot| now.views.saw(robot + 1, now.frame, 0));
+                    known.extrapolate(movers, now.world, &|robot| now.views.saw(robot + 1, now.frame, 0));
                 }
-                DriverKind::Places => tracks.extrapolate_true(movers, now.world, &|_| true),
+                DriverKind::Places => known.extrapolate(movers, now.world, &|_| true),
                 _ => {}
             }
         })?;

@@ -3,7 +3,7 @@
 use std::f32::consts::TAU;
 
 use super::situation::{in_axes_of, in_room, seen_from};
-use foreframe_sim::{PlanarPose, World};
+use foreframe_sim::PlanarPose;
 
 /// Places of one mover are not farther apart than this, in metres.
 const APART_M: f32 = 0.25;
@@ -21,10 +21,10 @@ const REMEMBERED_S: f32 = 2.5;
 const MISSED_S: f32 = 0.4;
 /// Root mean square of a speed along an axis, before anything is measured, in m/s.
 const USUAL_SPEED_M_S: f32 = 0.4;
-/// How far off a sighting is: near the camera, and more for each square metre of its squared distance, in metres.
+/// How far off a sighting is: at the camera, in metres, and how much more for its squared distance, in metres per square metre.
 const ERROR_M: f32 = 0.05;
 const ERROR_PER_M2: f32 = 0.05;
-/// How much farther off a sighting is that the side of the picture cuts off, in metres.
+/// How much farther off a sighting is if the side of the picture cuts the mover off, in metres.
 const CUT_ERROR_M: f32 = 0.15;
 /// A mover that reaches this near to the side of the picture may go on beyond it, in radians.
 const SIDE_RAD: f32 = 0.04;
@@ -81,8 +81,8 @@ impl Track {
         self.shown.clear();
     }
 
-    /// Where its middle is now, in the room, and its speed: the line that fits the sightings best; slower if they tell
-    /// little.
+    /// Where its middle is now, in the room, and its speed: the line that fits the sightings best. With few sightings, it is
+    /// slower than they are.
     fn now(&self) -> ([f32; 2], [f32; 2]) {
         let last_s = self.last_s();
         // Sums of weights, of weighted times and of their squares; the last holds what is known of speeds beforehand.
@@ -109,8 +109,6 @@ impl Track {
 #[derive(Debug, Default)]
 pub(super) struct MoverTracks {
     tracks: Vec<Track>,
-    /// Of all robots a frame ago: their true places.
-    places: Vec<[f32; 2]>,
 }
 
 impl MoverTracks {
@@ -162,40 +160,14 @@ impl MoverTracks {
             -track.last_s() <= if is_in_view { MISSED_S } else { REMEMBERED_S }
         });
     }
-
-    /// The same as `extrapolate` for the true places of robots. Their speeds are those of the last frame. `counts`: whether a
-    /// robot is known of.
-    pub(super) fn extrapolate_true(
-        &mut self,
-        movers: &mut [Vec<[f32; 2]>],
-        world: &World,
-        counts: &dyn Fn(usize) -> bool,
-    ) {
-        let places: Vec<[f32; 2]> = world
-            .other_robot_poses()
-            .iter()
-            .map(|pose| [pose.x_m, pose.y_m])
-            .collect();
-        let pose = world.observer_pose();
-        for (places_then, steps) in movers.iter_mut().zip(0u16..) {
-            let known = places.iter().enumerate().filter(|(robot, _)| counts(*robot));
-            let robots = known.flat_map(|(robot, &place)| {
-                let before = self.places.get(robot).copied().unwrap_or(place);
-                let step = [0, 1].map(|axis| place[axis] - before[axis]);
-                edge(later(place, step, f32::from(steps)), world.other_robot_radius_m(robot))
-            });
-            *places_then = robots.map(|place| seen_from(pose, place)).collect();
-        }
-        self.places = places;
-    }
 }
 
-fn later(place: [f32; 2], speed: [f32; 2], seconds: f32) -> [f32; 2] {
+pub(super) fn later(place: [f32; 2], speed: [f32; 2], seconds: f32) -> [f32; 2] {
     [0, 1].map(|axis| place[axis] + speed[axis] * seconds)
 }
 
 /// Places on the edge of a robot.
-fn edge(middle: [f32; 2], radius_m: f32) -> impl Iterator<Item = [f32; 2]> {
+pub(super) fn edge(middle: [f32; 2], radius_m: f32) -> impl Iterator<Item = [f32; 2]> {
     (0..EDGE_PLACES).map(move |nth| {
         let (sin, cos) = (TAU * nth as f32 / EDGE_PLACES as f32).sin_cos();
         [middle[0] + radius_m * cos, middle[1] + radius_m * sin]
