@@ -74,7 +74,7 @@ fn lock(cache: &Mutex<RenderedFiles>) -> MutexGuard<'_, RenderedFiles> {
 /// Results by key. If they take more than the limit, those that were not used for the longest time are dropped.
 struct RenderedFiles {
     limit: usize,
-    /// Of all files and their keys.
+    /// The size of all files and their keys.
     bytes: usize,
     by_use: LruCache<String, Bytes>,
 }

@@ -175,8 +175,8 @@ pub fn natural_order(a: &str, b: &str) -> Ordering {
     natural_parts(a).cmp(natural_parts(b)).then_with(|| a.cmp(b))
 }
 
-/// What orders each run of digits, and each run of other characters: of digits the number of them, after leading zeros. A run
-/// of digits and one of others differ in their first byte, by which any digit gives the same order as 0.
+/// The sort key of each run. A run of digits is compared by its length without leading zeros, then by its digits. A run of
+/// digits and one of other characters differ in their first byte, where every digit counts as 0.
 fn natural_parts(text: &str) -> impl Iterator<Item = (u8, usize, &[u8])> {
     let runs = text
         .as_bytes()

@@ -65,12 +65,12 @@ pub(in crate::server) struct Caller {
 }
 
 impl Caller {
-    /// Whether this caller may use what another made. What was made without a key is everybody's.
+    /// Whether this caller may use what another caller created. Anyone may use what was created without a key.
     pub(in crate::server) fn may_use(self, maker: Self) -> bool {
         maker.key.is_none() || maker.key == self.key
     }
 
-    /// Whether this caller may see what another made: its own, and with the scope `admin` everything.
+    /// Whether this caller may see what another caller created: its own, and with the scope `admin` everything.
     pub(in crate::server) fn may_see(self, maker: Self) -> bool {
         self.is_admin || self.may_use(maker)
     }

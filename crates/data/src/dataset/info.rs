@@ -60,8 +60,8 @@ impl DatasetInfo {
         world.map(|world| &world.camera)
     }
 
-    /// The camera of an episode with this trial: that of the trial, else the one of all trials, both with their height, else the one
-    /// in the description.
+    /// The camera of an episode: the trial's own, else that of all trials, else that of the description. The first two have a
+    /// height.
     #[doc(hidden)]
     #[must_use]
     pub fn camera_of(&self, trial: Option<&TrialParameters>) -> Option<CameraModel> {

@@ -189,7 +189,7 @@ struct Layout {
     column: usize,
     /// Below the title.
     top: usize,
-    /// Of every row.
+    /// The height of each row.
     heights: Vec<usize>,
 }
 
