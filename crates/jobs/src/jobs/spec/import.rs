@@ -195,12 +195,11 @@ impl ImportSpec {
     fn options(&self, csv: Option<PathBuf>) -> Result<ImportOptions, JobError> {
         let wrong =
             |option, value: &str, right: &str| JobError::invalid(option, format!("{value} is not valid; {right}"));
-        let size = parse_size(&self.size);
-        let (frame_width_px, frame_height_px) =
-            size.map_err(|right| wrong("size", &format!("\"{}\"", self.size.escape_default()), right))?;
+        let size = parse_size(&self.size)
+            .map_err(|right| wrong("size", &format!("\"{}\"", self.size.escape_default()), right))?;
         let options = ImportOptions {
-            frame_width_px,
-            frame_height_px,
+            frame_width_px: size.width,
+            frame_height_px: size.height,
             resize: self.resize,
             rate_hz: self.rate,
             every: self.every,

@@ -2,7 +2,7 @@
 
 use std::collections::VecDeque;
 
-use super::canvas::{Canvas, height_px};
+use super::canvas::{Canvas, TextStyle, height_px};
 use super::montage::enlarged;
 use crate::evaluation::drive::{DriveError, DriveSettings, DriveStep, DriverKind, replay};
 use foreframe_core::frame::{Frame, FrameError, codec};
@@ -13,6 +13,10 @@ const PAPER: u8 = 255;
 const INK: u8 = 0;
 const GAP_PX: usize = 8;
 const LETTER_SCALE: usize = 2;
+const TEXT: TextStyle = TextStyle {
+    scale: LETTER_SCALE,
+    ink: INK,
+};
 /// A line of the caption and the gap below it.
 const LINE_PX: usize = height_px(LETTER_SCALE) + 4;
 /// Driver, episode, time, collision.
@@ -100,7 +104,7 @@ fn joined(picture: &Frame, captions: &[String], room: &Frame) -> Result<Frame, F
     canvas.paste(room, [left, GAP_PX]);
     let first = GAP_PX + picture.height() as usize + 4;
     for (line, caption) in captions.iter().enumerate() {
-        canvas.write((GAP_PX, first + line * LINE_PX), caption, LETTER_SCALE, INK);
+        canvas.write(GAP_PX, first + line * LINE_PX, caption, TEXT);
     }
     Frame::new(width as u32, height as u32, canvas.pixels)
 }
