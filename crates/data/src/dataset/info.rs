@@ -12,7 +12,8 @@ use foreframe_sim::{CameraConfig, TrialParameters, WorldConfig};
 /// of the metadata file.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct DatasetInfo {
-    /// Its name, for reports.
+    /// Its title, for reports: the name of its directory, or the names of its parts joined by `+`. Not a
+    /// [`DatasetName`](foreframe_core::types::DatasetName), by which the program finds a data set: a directory can have any name.
     pub name: String,
     /// The simulated scenario; none for recordings.
     pub scenario: Option<String>,

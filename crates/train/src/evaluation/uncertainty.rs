@@ -35,7 +35,7 @@ pub struct UncertaintyScores {
 /// How well novelty tells another data set from the windows of the evaluation.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct NoveltyScores {
-    /// The other data set's name.
+    /// The other data set's title.
     pub dataset: String,
     /// Its windows.
     pub windows: usize,
