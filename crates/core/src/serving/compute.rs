@@ -101,7 +101,9 @@ fn encode(loaded: &Model, tasks: &[&Task]) -> Result<Vec<Features>, Failure> {
         return Ok(Vec::new());
     }
     let shape = (pixels.len() / spec.pixels(), spec.pixels());
-    let features = loaded.network.encode_frames(&Tensor::from_vec(pixels, shape, &Device::Cpu)?)?;
+    let features = loaded
+        .network
+        .encode_frames(&Tensor::from_vec(pixels, shape, &Device::Cpu)?)?;
     Ok(with_values(&features, |values| {
         let of_frames = values.chunks_exact(spec.code_len());
         of_frames.map(|features| Features::from(features.to_vec())).collect()
