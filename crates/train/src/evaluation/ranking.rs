@@ -1,4 +1,4 @@
-//! Would a planner choose what was driven? A recording has one future, that of its own actions. Where its actions
+//! Would a planner choose what was driven? A recording shows only what followed on its own actions. Where its actions
 //! change most, the camera's picture at the end is taken as a goal image: among the driven plan, the same mirrored, and plans of other
 //! windows, how often does the model predict that picture best under the driven one?
 
