@@ -119,6 +119,7 @@ impl Frame {
     }
 
     /// Width and height in pixels.
+    #[doc(hidden)]
     #[must_use]
     pub fn size(&self) -> FrameSize {
         FrameSize {
