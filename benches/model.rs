@@ -11,6 +11,7 @@ use foreframe_core::nn::{
 };
 use foreframe_core::types::Seed;
 use foreframe_train::training::TrainConfig;
+use foreframe_train::training::config::ArchitectureConfig;
 use foreframe_train::training::optimizer::{Gradients, Optimizer, OptimizerConfig};
 
 #[global_allocator]
@@ -41,13 +42,13 @@ fn specs() -> [(&'static str, ModelSpec); 2] {
         channel("linear", "m/s"),
         channel("angular", "rad/s"),
     ];
+    let layers = match TrainConfig::preset("moving-flow").unwrap().model.architecture {
+        ArchitectureConfig::Flow(layers) => layers,
+        ArchitectureConfig::Dense(_) => unreachable!("moving-flow has the flow network"),
+    };
     let flow = ModelSpec {
         architecture: Architecture::Flow(FlowSpec {
-            layers: TrainConfig::preset("moving-flow")
-                .unwrap()
-                .model
-                .flow
-                .unwrap_or_default(),
+            layers,
             camera: CameraModel::new(1.0, 0.2).ok(),
         }),
         conditioning: Conditioning::StateAction,

@@ -13,7 +13,7 @@ use foreframe_core::types::{Action, RobotState};
 
 /// A frame that is this share of a period early is not left out: a camera's clock is not exact.
 const EARLY: f64 = 0.25;
-/// After a gap of so many periods, the frames before are not those that the model expects to see.
+/// A gap longer than this many frame periods starts a new context.
 const GAP: f64 = 2.5;
 
 /// What a message held.

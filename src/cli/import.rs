@@ -9,6 +9,7 @@ use super::process::print_line;
 use super::progress::ProgressLine;
 use super::settings::CommonArgs;
 use super::workspace::{Workspace, dataset_name};
+use foreframe_core::frame::FrameSize;
 use foreframe_core::types::DatasetName;
 use foreframe_data::dataset::import::{ImportConfig, ImportOptions, import, parse_size};
 use foreframe_data::dataset::{DatasetInfo, is_finished};
@@ -48,7 +49,7 @@ pub(super) struct ImportArgs {
     out: Option<PathBuf>,
     /// Width and height of the frames in pixels, as in 64x64
     #[arg(long, value_name = "WxH", default_value = "64x64", value_parser = parse_size)]
-    size: (u32, u32),
+    size: FrameSize,
     #[command(flatten)]
     options: ImportOptions,
     #[command(flatten)]
@@ -66,8 +67,8 @@ pub(super) fn run(args: ImportArgs) -> Result<(), CliError> {
         source: args.source,
         out: out.clone(),
         options: ImportOptions {
-            frame_width_px: args.size.0,
-            frame_height_px: args.size.1,
+            frame_width_px: args.size.width,
+            frame_height_px: args.size.height,
             ..args.options
         },
         disk_mib: workspace.config.server.import_disk_mib,

@@ -7,13 +7,13 @@ use serde::{Deserialize, Deserializer, Serialize, Serializer, de};
 use super::http::problem::ApiError;
 use foreframe_core::error_text::with_causes;
 use foreframe_core::frame::resize::{Resize, resize};
-use foreframe_core::frame::{Frame, FrameError, codec};
+use foreframe_core::frame::{Frame, FrameError, FrameSize, codec};
 use foreframe_core::registry::Manifest;
 use foreframe_core::serving::check_size;
 
 /// The most pixels of an image that is resized. An image states its size in few bytes, so this bounds the memory that a
 /// small body can take.
-const MAX_FIT_PIXELS: u32 = 1 << 22;
+const MAX_RESIZED_PIXELS: u32 = 1 << 22;
 
 /// How images are encoded, in both directions: `raw` is gray bytes, row by row, of the model's size; images sent as `jpeg`
 /// are answered with `png`, which is lossless. An incomplete image is refused, and so is a changed one if the change can be
@@ -137,13 +137,10 @@ pub(in crate::server) fn decode(
         }
         return Frame::new(model_width, model_height, bytes).map_err(refused);
     }
-    check_fit(
-        field,
-        codec::dimensions(&bytes).map_err(refused)?,
-        input.resize,
-        manifest,
-    )?;
-    fit(field, codec::decode(&bytes).map_err(refused)?, input.resize, manifest)
+    let size = codec::dimensions(&bytes).map_err(refused)?;
+    check_resizable(field, size, input.resize, manifest)?;
+    let frame = codec::decode(&bytes).map_err(refused)?;
+    resized(field, frame, input.resize, manifest)
 }
 
 /// The gray image in an array `[height, width]`, `[height, width, 1]` or `[height, width, 3]` (red, green, blue).
@@ -164,34 +161,30 @@ pub(in crate::server) fn from_array(field: &str, shape: &[usize], values: Vec<u8
 }
 
 /// Pixels of any size as a frame of the model's size. `way`: how another size is resized; `None` refuses it.
-pub(in crate::server) fn fit(
+pub(in crate::server) fn resized(
     field: &str,
     frame: Frame,
     way: Option<Resize>,
     manifest: &Manifest,
 ) -> Result<Frame, ImageError> {
-    check_fit(field, (frame.width(), frame.height()), way, manifest)?;
+    check_resizable(field, frame.size(), way, manifest)?;
     let spec = &manifest.spec;
     let Some(way) = way else { return Ok(frame) };
-    let resized = resize(&frame, spec.frame_width_px, spec.frame_height_px, way);
-    resized.map_err(|error| ImageError::Refused(format!("{field} is {error}")))
+    let frame = resize(&frame, spec.frame_width_px, spec.frame_height_px, way);
+    frame.map_err(|error| ImageError::Refused(format!("{field} is {error}")))
 }
 
 /// Errors: `Refused` if an image of that size cannot become a frame of the model.
-fn check_fit(
-    field: &str,
-    (width, height): (u32, u32),
-    way: Option<Resize>,
-    manifest: &Manifest,
-) -> Result<(), ImageError> {
+fn check_resizable(field: &str, size: FrameSize, way: Option<Resize>, manifest: &Manifest) -> Result<(), ImageError> {
+    let FrameSize { width, height } = size;
     if way.is_none() {
         let checked = check_size(field, manifest, (width, height));
         return checked
             .map_err(|error| ImageError::Refused(format!("{error}; set resize to crop, letterbox or stretch")));
     }
-    if width.saturating_mul(height) > MAX_FIT_PIXELS {
+    if width.saturating_mul(height) > MAX_RESIZED_PIXELS {
         return Err(ImageError::Refused(format!(
-            "{field} is {width}×{height} px; an image to resize has at most {MAX_FIT_PIXELS} pixels"
+            "{field} is {width}×{height} px; an image to resize has at most {MAX_RESIZED_PIXELS} pixels"
         )));
     }
     Ok(())

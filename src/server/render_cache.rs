@@ -1,5 +1,6 @@
 //! Pictures and reports: made on threads of their own, so that predictions do not wait for them, and kept in a cache of
-//! bounded size.
+//! bounded size. It drops what was not used for the longest time, exactly, which `quick_cache` does only about; `hashlink` comes
+//! with sqlx anyway.
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
@@ -74,7 +75,7 @@ fn lock(cache: &Mutex<RenderedFiles>) -> MutexGuard<'_, RenderedFiles> {
 /// Results by key. If they take more than the limit, those that were not used for the longest time are dropped.
 struct RenderedFiles {
     limit: usize,
-    /// Of all files and their keys.
+    /// The size of all files and their keys.
     bytes: usize,
     by_use: LruCache<String, Bytes>,
 }

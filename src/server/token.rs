@@ -2,6 +2,8 @@
 
 use sha2::{Digest as _, Sha256};
 
+use foreframe_core::files::{from_hex, hex};
+
 /// 256 random bits.
 #[derive(Clone)]
 pub(in crate::server) struct Token([u8; 32]);
@@ -29,12 +31,12 @@ impl Token {
 
     /// All bits as a secret, hexadecimal.
     pub(in crate::server) fn text(&self) -> String {
-        hex::encode(self.0)
+        hex(&self.0)
     }
 
     /// 128 of the bits as an id, hexadecimal.
     pub(in crate::server) fn id(&self) -> String {
-        hex::encode(&self.0[..16])
+        hex(&self.0[..16])
     }
 
     /// 64 of the bits as a number.
@@ -51,12 +53,10 @@ impl TokenHash {
 
     /// From hexadecimal; `None` if the text is something else.
     pub(in crate::server) fn from_hex(text: &str) -> Option<Self> {
-        let mut hash = [0; 32];
-        hex::decode_to_slice(text, &mut hash).ok()?;
-        Some(Self(hash))
+        from_hex(text).map(Self)
     }
 
     pub(in crate::server) fn to_hex(self) -> String {
-        hex::encode(self.0)
+        hex(&self.0)
     }
 }

@@ -1,9 +1,9 @@
 //! The order of the source: crates are layers, which the compiler keeps apart; within a crate no files or folders use each
 //! other in a circle; and some dependencies are used only in certain folders.
 
-use crate::source_graph::{SourceFile, circles, source_files, uses};
+use crate::source_graph::{SourceFile, circles, source_files, tokens, uses, without_tests};
 
-/// The folders in which a dependency may be used.
+/// The folders in which a dependency may be used. Without `::`, every crate whose name begins so.
 const USED_IN: &[(&str, &[&str])] = &[
     (
         "candle_core",
@@ -31,11 +31,22 @@ const USED_IN: &[(&str, &[&str])] = &[
     ("rustix", &["crates/data/src/dataset", "crates/jobs/src/jobs"]),
 ];
 
-/// The lines of code before the unit tests, without comments.
+/// The lines of code without what only unit tests use, and without comments.
 fn code(text: &str) -> impl Iterator<Item = &str> {
-    text.lines()
-        .take_while(|line| line.trim() != "#[cfg(test)]")
+    without_tests(text)
+        .into_iter()
         .filter(|line| !line.trim_start().starts_with("//"))
+}
+
+/// Whether the code has a path that begins with a crate of this name: in a `use`, an attribute, or anywhere else.
+fn names_crate(code: &[&str], name: &str) -> bool {
+    let is_name = |token: &str| match name.strip_suffix("::") {
+        Some(name) => token == name,
+        None => token.starts_with(name),
+    };
+    let begins = |at: usize| at == 0 || code[at - 1] != ":";
+    let goes_on = |at: usize| code.get(at + 1..at + 3) == Some(&[":", ":"]);
+    (0..code.len()).any(|at| is_name(code[at]) && begins(at) && goes_on(at))
 }
 
 /// The files of the library and the program; the load tests are tests.
@@ -88,20 +99,38 @@ fn a_circle_is_found() {
 #[test]
 fn dependencies_are_used_only_in_their_folders() {
     for file in files() {
+        let lines: Vec<&str> = code(&file.text).collect();
+        let text = lines.join("\n");
+        let code = tokens(&text);
         for (name, folders) in USED_IN {
             let is_inside = |folder: &&str| {
                 file.path
                     .strip_prefix(*folder)
                     .is_some_and(|rest| rest.starts_with(['/', '.']))
             };
-            let is_use = |line: &str| line.trim_start().starts_with(&format!("use {name}"));
             assert!(
-                folders.iter().any(is_inside) || !code(&file.text).any(is_use),
+                folders.iter().any(is_inside) || !names_crate(&code, name),
                 "{} uses {name}, which is for {folders:?} only",
                 file.path
             );
         }
     }
+}
+
+#[test]
+fn a_crate_is_found_wherever_a_path_names_it() {
+    let names = |text: &str| names_crate(&tokens(text), "zip::");
+    assert!(names("use zip::ZipArchive;") && names("fn open() -> zip::Result<()> {}") && names("#[zip::main]"));
+    assert!(!names("use crate::zip::Archive;") && !names("values.zip(others)") && !names("zips::x()"));
+    assert!(names_crate(&tokens("tokio_util::io::copy()"), "tokio"));
+}
+
+#[test]
+fn only_what_tests_use_is_left_out() {
+    let text = "fn a() {}\n#[cfg(test)]\nmod x;\nimpl B {\n    #[cfg(test)]\n    fn c(\n        self,\n    ) {\n        d();\n    }\n    \
+                fn e() {}\n}\n#[cfg(test)]\nmod tests {\n    fn f() {}\n}\nfn g() {}";
+    let left: Vec<&str> = code(text).map(str::trim).collect();
+    assert_eq!(left, ["fn a() {}", "impl B {", "fn e() {}", "}", "fn g() {}"]);
 }
 
 #[test]

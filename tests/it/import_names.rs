@@ -8,6 +8,7 @@ use std::sync::atomic::AtomicBool;
 use std::sync::mpsc;
 use std::time::Duration;
 
+use foreframe_core::files::hex;
 use foreframe_data::dataset::import::{
     DEFAULT_DISK_MIB, DEFAULT_MAX_FILES, ImportConfig, ImportError, ImportOptions, Imported, import,
 };
@@ -140,7 +141,7 @@ fn computed_tables() -> impl Strategy<Value = String> {
                     let always = if a { word("generated always") } else { String::new() };
                     let stored = if b { word("stored") } else { String::new() };
                     // Of the five frames, the first one again and again.
-                    let value = format!("CAST(x'{}' AS BLOB)", hex::encode(&frame(0).content));
+                    let value = format!("CAST(x'{}' AS BLOB)", hex(&frame(0).content));
                     let value = if table == "topics" { "'cdr'".to_owned() } else { value };
                     format!(
                         "{moved} CREATE TABLE {name}({typed}, {last}{left}{always}{right}{}({value}){stored});
@@ -152,7 +153,7 @@ fn computed_tables() -> impl Strategy<Value = String> {
                     let value = if table == "topics" {
                         "'cdr'".to_owned()
                     } else {
-                        format!("x'{}'", hex::encode(&frame(0).content))
+                        format!("x'{}'", hex(&frame(0).content))
                     };
                     format!(
                         "{moved} CREATE TABLE {name}({typed});

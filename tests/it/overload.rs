@@ -342,7 +342,7 @@ async fn requests_beyond_their_limit_leave_the_places_of_streams() {
     server.stop().await;
 }
 
-/// A data set "seen" with that many episodes.
+/// A data set "seen" with this number of episodes.
 fn with_dataset(dir: &Path, episodes: u64) {
     let config = CollectConfig {
         world: WorldConfig {

@@ -47,6 +47,22 @@ pub(crate) fn source_files() -> BTreeMap<Module, SourceFile> {
     files
 }
 
+/// The lines of a formatted file without the items that are there only for its unit tests.
+pub(crate) fn without_tests(text: &str) -> Vec<&str> {
+    let indent = |line: &str| line.len() - line.trim_start().len();
+    let (mut lines, mut kept) = (text.lines(), Vec::new());
+    while let Some(line) = lines.next() {
+        if line.trim() != "#[cfg(test)]" {
+            kept.push(line);
+            continue;
+        }
+        // The item ends with the first line that is indented as its attribute and closes it.
+        let closes = |inner: &&str| indent(inner) == indent(line) && inner.ends_with(['}', ';', ',']);
+        lines.find(closes);
+    }
+    kept
+}
+
 /// What a file names.
 #[derive(Default)]
 struct Names {
@@ -57,7 +73,7 @@ struct Names {
 }
 
 /// Identifiers and single other characters of the code, without comments, strings and characters.
-fn tokens(text: &str) -> Vec<&str> {
+pub(crate) fn tokens(text: &str) -> Vec<&str> {
     let bytes = text.as_bytes();
     let (mut found, mut at) = (Vec::new(), 0);
     while at < bytes.len() {

@@ -7,7 +7,7 @@ use foreframe_jobs::store::{EnqueueResult, JobId, JobReport, NewJob, Store};
 
 use crate::store::{job, outcome, stores};
 
-/// Enqueues so many jobs with so many parts each. Then `workers` claim and end them, one after another. Returns the ids in the
+/// Enqueues `jobs` jobs with `parts` parts each. Then `workers` claim and end them, one after another. Returns the ids in the
 /// order in which they were claimed, and the claims per second.
 async fn work(store: &Store, jobs: usize, parts: usize, workers: usize) -> (Vec<JobId>, f64) {
     for _ in 0..jobs {

@@ -187,7 +187,7 @@ async fn predictions_do_not_wait_for_a_plan_and_plans_that_are_due_meanwhile_are
     let app = moving(dir.path());
     let server = run(app.clone()).await;
     let (_, mut client) = open(&app, server.address, Codec::Msgpack).await;
-    // So many plans that the search uses up its budget of 1.5 s.
+    // Enough plans to use up the search's budget of 1.5 s.
     let long = json!({"samples": 4096, "iterations": 32});
     client.ask(&plans(Some(1), Some(body(0.5, &long)))).await;
     for seq in 0..CONTEXT as u64 - 1 {

@@ -167,7 +167,27 @@ pub fn none_if_missing<T>(found: io::Result<T>) -> io::Result<Option<T>> {
 /// SHA-256 in lower-case hexadecimal digits.
 #[must_use]
 pub fn sha256_hex(bytes: &[u8]) -> String {
-    format!("{:x}", Sha256::digest(bytes))
+    hex(&Sha256::digest(bytes))
+}
+
+/// Two lower-case hexadecimal digits for each byte.
+#[must_use]
+pub fn hex(bytes: &[u8]) -> String {
+    let digit = |half: u8| char::from(b"0123456789abcdef"[usize::from(half)]);
+    bytes
+        .iter()
+        .flat_map(|byte| [digit(byte >> 4), digit(byte & 15)])
+        .collect()
+}
+
+/// The bytes of exactly `N` pairs of hexadecimal digits; `None` of other text.
+#[must_use]
+pub fn from_hex<const N: usize>(text: &str) -> Option<[u8; N]> {
+    let digit = |byte: u8| u8::try_from(char::from(byte).to_digit(16)?).ok();
+    let (pairs, rest) = text.as_bytes().as_chunks::<2>();
+    let bytes = pairs.iter().map(|[high, low]| Some(digit(*high)? << 4 | digit(*low)?));
+    let bytes: Vec<u8> = bytes.collect::<Option<_>>()?;
+    if rest.is_empty() { bytes.try_into().ok() } else { None }
 }
 
 /// Compares runs of digits as numbers, so that `2.png` comes before `10.png`.
@@ -175,8 +195,8 @@ pub fn natural_order(a: &str, b: &str) -> Ordering {
     natural_parts(a).cmp(natural_parts(b)).then_with(|| a.cmp(b))
 }
 
-/// What orders each run of digits, and each run of other characters: of digits the number of them, after leading zeros. A run
-/// of digits and one of others differ in their first byte, by which any digit gives the same order as 0.
+/// The sort key of each run. A run of digits is compared by its length without leading zeros, then by its digits. A run of
+/// digits and one of other characters differ in their first byte, where every digit counts as 0.
 fn natural_parts(text: &str) -> impl Iterator<Item = (u8, usize, &[u8])> {
     let runs = text
         .as_bytes()
@@ -195,6 +215,24 @@ mod tests {
     use std::time::SystemTime;
 
     use super::*;
+
+    #[test]
+    fn hexadecimal_digits_give_the_same_bytes_again() {
+        let bytes = [0x00, 0x7f, 0xa5, 0xff];
+        assert_eq!(hex(&bytes), "007fa5ff");
+        assert_eq!(from_hex("007fA5ff"), Some(bytes));
+        for wrong in [
+            "007fa5f",
+            "007fa5ff0",
+            "007fa5",
+            "007fa5fg",
+            "007fa5+f",
+            "007fa5 f",
+            "007fa5é",
+        ] {
+            assert_eq!(from_hex::<4>(wrong), None, "{wrong}");
+        }
+    }
 
     #[test]
     fn the_hash_of_abc_matches_the_standard() {

@@ -72,6 +72,15 @@ pub enum FrameError {
     },
 }
 
+/// Width and height of an image in pixels.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct FrameSize {
+    /// Width in pixels.
+    pub width: u32,
+    /// Height in pixels.
+    pub height: u32,
+}
+
 /// A gray image with 8 bits per pixel, row by row from the top left.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Frame {
@@ -107,6 +116,16 @@ impl Frame {
     #[must_use]
     pub fn height(&self) -> u32 {
         self.height
+    }
+
+    /// Width and height in pixels.
+    #[doc(hidden)]
+    #[must_use]
+    pub fn size(&self) -> FrameSize {
+        FrameSize {
+            width: self.width,
+            height: self.height,
+        }
     }
 
     /// Intensities 0 (black) to 255 (white), row by row.

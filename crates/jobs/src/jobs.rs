@@ -56,10 +56,10 @@ pub enum JobError {
     /// Parts of a cancelled job still run.
     #[error("parts of job {0} have not stopped yet; resume it when they have")]
     PartsStopping(JobId),
-    /// The queue is full: so many jobs are waiting.
+    /// The queue is full. Holds the number of waiting jobs.
     #[error("the job queue is full ({0} jobs are waiting); cancel one or try again later")]
     QueueFull(usize),
-    /// The submitter's share of the queue is full: so many of its jobs are waiting.
+    /// The key's share of the queue is full. Holds the number of its waiting jobs.
     #[error("{0} jobs of this API key are waiting, which is its share of the job queue; cancel one or try again later")]
     ShareFull(i64),
     /// A field of the job is not valid.

@@ -161,8 +161,8 @@ impl Versions {
         Ok(self.all().await?.remove(model).unwrap_or_default())
     }
 
-    /// The metrics of a model: the latest that an evaluation job measured with these weights on the data of its training (or on
-    /// any, if the manifest has no test scores), else those of the manifest.
+    /// The metrics of a model: from its latest evaluation job with these weights on its training data, else from the manifest. If
+    /// the manifest has no test scores, any data set counts.
     /// Errors: `Store`.
     pub async fn metrics(&self, manifest: &Manifest) -> Result<serde_json::Value, VersionError> {
         let measured = self.store.model_metrics().await?.into_iter().find(|measured| {

@@ -37,7 +37,7 @@ pub(crate) enum SendMode {
 #[derive(Clone, Copy)]
 pub(crate) struct RobotLoad {
     pub(crate) sessions: usize,
-    /// With it, each robot asks for a plan with every prediction, chosen from so many.
+    /// If set, each robot asks for a plan with every prediction: the best of this number of plans.
     pub(crate) plan_samples: Option<usize>,
     pub(crate) mode: SendMode,
     /// What the server does with frames that newer ones have overtaken.

@@ -83,7 +83,7 @@ pub(crate) async fn ready(socket: &mut Socket) -> Result<u64, Box<Error>> {
     }
 }
 
-/// Asks for a plan with every prediction, chosen from so many plans.
+/// Asks for a plan with every prediction: the best of `samples` plans.
 pub(crate) async fn ask_for_plans(socket: &mut Socket, samples: usize) {
     let request =
         json!({"goal": {"position_m": [0.5, 0.1]}, "search": {"solver": {"samples": samples, "iterations": 1}}});

@@ -23,7 +23,7 @@ pub(super) struct Navigator {
     heading: Pid,
     distance: Pid,
     random: ChaCha8Rng,
-    /// Of a robot that drives to and fro.
+    /// `None` unless the robot drives to and fro.
     crossing: Option<Crossing>,
 }
 

@@ -205,7 +205,7 @@ class Client:
     ) -> Plan:
         """Searches for the plan that reaches ``goal`` best, from a context.
 
-        ``present``: the plan that the robot follows now, one of the candidates. ``action``: the action before the plan.
+        ``present``: the plan that the robot follows now, always one of the plans tried. ``action``: the action before the plan.
         ``with_obstacles``: whether the answer has what stands in the way, and where movers will be.
         ``search``: what is not the default, by keyword: ``solver`` (``random-shooting``, ``cem`` or ``mppi``), ``samples``,
         ``iterations``, ``seed``, ``budget_ms``, ``costs`` (weights by name), ``limits`` (for each action channel ``low``, ``high`` and

@@ -40,7 +40,7 @@ def action_space(channels: Sequence[Channel]) -> spaces.Box:
 
 
 def observation_space(size: tuple[int, int], states: int) -> spaces.Dict:
-    """The space of frames of that height and width, with that many components of a state, which have no bounds."""
+    """The space of frames of this height and width, with ``states`` components of a state, which have no bounds."""
     parts: dict[str, spaces.Space[Any]] = {"frame": spaces.Box(0, 255, (*size, 1), np.uint8)}
     if states:
         parts["state"] = spaces.Box(-np.inf, np.inf, (states,), np.float32)

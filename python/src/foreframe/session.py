@@ -122,7 +122,7 @@ class Session:
     def plan_every(
         self, frames: int, goal: Goal | None = None, *, with_obstacles: bool = False, **search: Any
     ) -> None:
-        """Asks for a plan with every so many predictions, from the next one on; 0: for none.
+        """Asks for a plan with every ``frames``-th prediction, from the next one on; 0: for none.
 
         The server searches beside the predictions, which do not wait; ``step`` gives the newest plan as ``answer.plan``, often of
         the frame before. ``goal`` is relative to the robot at the frame of each plan: call this again as the robot moves.

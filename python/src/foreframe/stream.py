@@ -176,7 +176,7 @@ class SessionFlow:
     def plan_every(
         self, frames: int, goal: Goal | None, with_obstacles: bool, search: Mapping[str, Any]
     ) -> Flow[None]:
-        """Asks for a plan with every so many predictions; 0: for none."""
+        """Asks for a plan with every ``frames``-th prediction; 0: for none."""
         if frames < 0 or (frames > 0 and goal is None):
             raise ValueError(f"plan_every is {frames}, and the goal {goal}; give 1 or more with a goal, or 0")
         if frames == 0:

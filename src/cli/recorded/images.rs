@@ -26,7 +26,7 @@ pub(in crate::cli) struct SeenFrames {
     #[arg(long, value_name = "N")]
     at: Option<usize>,
     /// What to do with images of another size than the model's: crop, letterbox or stretch [default: refuse them]
-    #[arg(long, value_name = "FIT")]
+    #[arg(long, value_name = "RESIZE")]
     resize: Option<Resize>,
 }
 

@@ -13,7 +13,7 @@ use foreframe_core::metric_names;
 /// The limits of a [`ConnectionTable`].
 pub(super) struct ConnectionLimits {
     pub(super) total: usize,
-    /// Of one IPv4 address, or one /64 network of IPv6.
+    /// The limit of one IPv4 address, or one /64 network of IPv6.
     pub(super) per_address: usize,
     /// How long a connection must have been idle to give its place to another.
     pub(super) evict_after: Duration,

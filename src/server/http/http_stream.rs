@@ -1,4 +1,7 @@
 //! What HTTP reads from and writes to a connection, with or without TLS.
+//!
+//! hyper itself answers what it cannot parse, without a body, and lets nobody else do it: the bytes that it writes are the only
+//! place where such a 400 can become problem details like all other errors.
 
 use std::io;
 use std::pin::Pin;

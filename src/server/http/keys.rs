@@ -20,6 +20,7 @@ use super::access::{required_scope, route};
 use super::problem::ApiError;
 use super::rate::RateLimit;
 use crate::server::token::{RandomError, TokenHash};
+use foreframe_core::files::hex;
 use foreframe_core::metric_names;
 use foreframe_jobs::store::{Author, KeyRow, KeyScope, Store, StoreError};
 
@@ -50,7 +51,7 @@ impl NewKey {
         let (mut id, mut secret) = ([0; ID_BYTES], [0; SECRET_BYTES]);
         getrandom::fill(&mut id)?;
         getrandom::fill(&mut secret)?;
-        let id = hex::encode(id);
+        let id = hex(&id);
         let text = format!("{PREFIX}_{id}_{}", URL_SAFE_NO_PAD.encode(secret));
         let hash = TokenHash::of(&text).to_hex();
         Ok(Self { id, text, hash })
@@ -65,12 +66,12 @@ pub(in crate::server) struct Caller {
 }
 
 impl Caller {
-    /// Whether this caller may use what another made. What was made without a key is everybody's.
+    /// Whether this caller may use what another caller created. Anyone may use what was created without a key.
     pub(in crate::server) fn may_use(self, maker: Self) -> bool {
         maker.key.is_none() || maker.key == self.key
     }
 
-    /// Whether this caller may see what another made: its own, and with the scope `admin` everything.
+    /// Whether this caller may see what another caller created: its own, and with the scope `admin` everything.
     pub(in crate::server) fn may_see(self, maker: Self) -> bool {
         self.is_admin || self.may_use(maker)
     }

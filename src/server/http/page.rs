@@ -28,7 +28,7 @@ impl Page {
         checked_limit(self.limit, DEFAULT_LIMIT)
     }
 
-    /// Of sorted entries, those of this page, and the key of the last one if more follow. Errors: as [`Page::limit`].
+    /// Takes sorted entries; returns this page, and the key of its last entry if more follow. Errors: as [`Page::limit`].
     pub(in crate::server) fn of<T>(
         &self,
         all: impl IntoIterator<Item = T>,
@@ -42,8 +42,7 @@ impl Page {
     }
 }
 
-/// Of the first entries, one more than the limit if there are so many, those of the page, and the key of the last one if more
-/// follow.
+/// Shortens `limit + 1` entries to `limit`. Also gives the key of the last entry kept, if there are more.
 pub(in crate::server) fn cut<T, K>(mut entries: Vec<T>, limit: usize, key: impl Fn(&T) -> K) -> (Vec<T>, Option<K>) {
     let has_more = entries.len() > limit;
     entries.truncate(limit);

@@ -63,7 +63,7 @@ impl OpenpiObservation {
             seq,
             timestamp_us: 0,
             conditioning: conditions.check(&OBSERVATION_FIELDS, manifest, max_steps)?,
-            frame: images::fit("frame", image(frame)?, self.resize, manifest)?,
+            frame: images::resized("frame", image(frame)?, self.resize, manifest)?,
             format: ImageFormat::Raw,
             is_overtaken: false,
         })

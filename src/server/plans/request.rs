@@ -141,7 +141,7 @@ impl SessionPlanRequest {
         config: &ServerConfig,
     ) -> Result<PlannerInput, ApiError> {
         let (_, state) = request_inputs::states(self.state, None, 0)?;
-        let reading = ImageInput {
+        let images = ImageInput {
             format: self.format,
             resize,
         };
@@ -155,7 +155,12 @@ impl SessionPlanRequest {
             present,
             action: self.action,
         };
-        given.input(self.goal, self.search, reading, (manifest, config))
+        let reading = PlanReading {
+            images,
+            manifest,
+            config,
+        };
+        given.input(self.goal, self.search, reading)
     }
 }
 
@@ -173,19 +178,31 @@ pub(in crate::server) struct GivenToPlanner {
     pub(in crate::server) action: Option<Vec<f32>>,
 }
 
+/// How a request for a plan is read.
+#[derive(Clone, Copy)]
+pub(in crate::server) struct PlanReading<'a> {
+    pub(in crate::server) images: ImageInput,
+    pub(in crate::server) manifest: &'a Manifest,
+    pub(in crate::server) config: &'a ServerConfig,
+}
+
 impl GivenToPlanner {
     /// What the search starts from.
     pub(in crate::server) fn input(
         self,
         goal: PlanGoal,
         search: PlanSearch,
-        reading: ImageInput,
-        (manifest, config): (&Manifest, &ServerConfig),
+        reading: PlanReading<'_>,
     ) -> Result<PlannerInput, ApiError> {
+        let PlanReading {
+            images,
+            manifest,
+            config,
+        } = reading;
         request_inputs::check_steps(search.steps, manifest, config)?;
         let image = goal
             .image
-            .map(|image| images::decode("goal.image", image, reading, manifest));
+            .map(|image| images::decode("goal.image", image, images, manifest));
         Ok(PlannerInput {
             goal: Goal {
                 position_m: goal.position_m,

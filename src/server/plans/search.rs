@@ -10,8 +10,7 @@ use crate::server::http::problem::ApiError;
 use foreframe_core::metric_names;
 use foreframe_core::planning::{PlanBatch, PlanChoice, PlanContext, PlanError, Planner, PlannerInput};
 use foreframe_core::registry::Model;
-use foreframe_core::serving::{ConditioningInput, Prediction, Predictor};
-use foreframe_core::types::RobotState;
+use foreframe_core::serving::{ConditioningInput, Prediction, Predictor, Task};
 
 /// A search that has not run.
 pub(in crate::server) struct PlanTask {
@@ -53,7 +52,9 @@ impl PlanTask {
             (planner, batch) = blocking.run(next).await??;
             let Some(batch) = batch else { break };
             let asked = Instant::now();
-            let Some(prediction) = self.predict(predictor, batch, (state.clone(), steps), budget).await? else {
+            let inputs = ConditioningInput::of_plans(batch.plans, state.clone(), Some(steps), &self.model.manifest)?;
+            let task = self.context.task(inputs, batch.sees_occupancy);
+            let Some(prediction) = self.predict(predictor, task, budget).await? else {
                 break;
             };
             predicted = Some((prediction, asked.elapsed()));
@@ -66,16 +67,13 @@ impl PlanTask {
         })
     }
 
-    /// The prediction of a batch; `None` if the budget was over before it came.
+    /// The prediction of a batch of plans; `None` if the budget was over before it came.
     async fn predict(
         &self,
         predictor: &Predictor,
-        batch: PlanBatch,
-        (state, steps): (Option<RobotState>, usize),
+        task: Task,
         budget: Option<Duration>,
     ) -> Result<Option<Prediction>, ApiError> {
-        let inputs = ConditioningInput::of_plans(batch.plans, state, Some(steps), &self.model.manifest)?;
-        let task = self.context.task(inputs, batch.sees_occupancy);
         let computed = predictor.compute(&self.model, task, self.session);
         let Some(budget) = budget else {
             return Ok(Some(computed.await?));

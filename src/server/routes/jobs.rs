@@ -125,7 +125,7 @@ async fn create(
     let key = key.transpose().map_err(|_| {
         ApiError::Unprocessable("the header Idempotency-Key must be visible ASCII characters".to_owned())
     })?;
-    Ok(accepted(app.jobs().submit_as(author.key_id(), spec, key).await?))
+    Ok(accepted(app.jobs().submit(author.key_id(), spec, key).await?))
 }
 
 /// Estimates what a training will need, without starting it.

@@ -89,7 +89,7 @@ struct Lineage {
 }
 
 impl ModelDescription {
-    /// Of the active version and the numbers of all versions.
+    /// Describes the active version; `versions` lists all version numbers.
     fn new(manifest: &Manifest, mut versions: Vec<u32>, metrics: serde_json::Value) -> Self {
         // A model that was given to the server at its start may be in no directory.
         if let Err(place) = versions.binary_search(&manifest.version) {

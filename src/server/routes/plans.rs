@@ -72,7 +72,7 @@ async fn model_plan(
     picture::threads_for(&app, wanted).run(encode).await?
 }
 
-/// Searches for the plan that reaches a goal best, from the session's last frame. The plan of that frame is one of the candidates. The
+/// Searches for the plan that reaches a goal best, from the session's last frame. The plan of that frame is always one of the plans tried. The
 /// session does not change.
 #[utoipa::path(
     post, path = "/v1/sessions/{id}/plan",

@@ -175,9 +175,9 @@ impl PredictRequest {
 #[derive(Debug, Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Units {
-    /// Of the components of an action.
+    /// The unit of each component of an action.
     actions: Option<Vec<String>>,
-    /// Of the components of a state.
+    /// The unit of each component of a state.
     state: Option<Vec<String>>,
 }
 

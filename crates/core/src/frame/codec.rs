@@ -7,7 +7,7 @@ use image::{
     DynamicImage, ExtendedColorType, GrayImage, ImageDecoder as _, ImageEncoder, ImageFormat, ImageReader, Limits,
 };
 
-use super::{Frame, FrameError, MAX_SIDE_PX, jpeg};
+use super::{Frame, FrameError, FrameSize, MAX_SIDE_PX, jpeg};
 
 /// Limit for an image's metadata after decompression, in bytes: colour profiles and similar.
 const MAX_METADATA_BYTES: u64 = 1 << 20;
@@ -17,7 +17,7 @@ const MAX_PIXEL_BYTES: u64 = 8;
 /// Reads a PNG or JPEG image and converts it to gray. Errors: `Size` if a side is larger than [`MAX_SIDE_PX`]; `Decode` if
 /// the bytes are not PNG or JPEG; `Damaged` for a JPEG image whose data is incomplete or not valid.
 pub fn decode(bytes: &[u8]) -> Result<Frame, FrameError> {
-    let (width, height) = dimensions(bytes)?;
+    let FrameSize { width, height } = dimensions(bytes)?;
     if width.max(height) > MAX_SIDE_PX {
         return Err(FrameError::Size { width, height });
     }
@@ -36,9 +36,10 @@ pub fn decode(bytes: &[u8]) -> Result<Frame, FrameError> {
 
 /// Reads width and height of a PNG or JPEG image without decoding its pixels. Errors: `Decode` if the bytes are not PNG
 /// or JPEG.
-pub fn dimensions(bytes: &[u8]) -> Result<(u32, u32), FrameError> {
+pub fn dimensions(bytes: &[u8]) -> Result<FrameSize, FrameError> {
     let reader = reader(bytes, MAX_METADATA_BYTES)?;
-    reader.into_dimensions().map_err(FrameError::Decode)
+    let (width, height) = reader.into_dimensions().map_err(FrameError::Decode)?;
+    Ok(FrameSize { width, height })
 }
 
 /// Whether a PNG or JPEG image has color channels, without decoding its pixels. Errors: `Decode` if the bytes are neither.
@@ -119,7 +120,7 @@ mod tests {
             let pixels = (0..width * height).map(|i| (i * 31 + u32::from(seed)) as u8).collect();
             let frame = Frame::new(width, height, pixels).unwrap();
             let png = encode_png(&frame).unwrap();
-            prop_assert_eq!(dimensions(&png).unwrap(), (width, height));
+            prop_assert_eq!(dimensions(&png).unwrap(), FrameSize { width, height });
             prop_assert_eq!(decode(&encode_rgb_png(&frame).unwrap()).unwrap(), frame.clone());
             prop_assert_eq!(decode(&png).unwrap(), frame);
         }

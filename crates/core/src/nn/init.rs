@@ -1,5 +1,6 @@
 //! Initial weights from a seeded random generator. Each tensor has its own random stream, named after the tensor, so that
-//! its values do not depend on which other tensors a model has.
+//! its values do not depend on which other tensors a model has. candle-nn's `init` takes no seed on the CPU, so the same
+//! training would give other weights each time.
 //!
 //! - Linear weights `[D, O]`: uniform ±√(6 / (D + O)) (Glorot & Bengio 2010); biases 0.
 //! - LSTM weights and peepholes: uniform ±1/√H; biases 0, the forget gate's 1 (Jozefowicz et al. 2015).

@@ -1,4 +1,5 @@
-//! Loss functions: the difference of a prediction and its target as one number.
+//! Loss functions: the difference of a prediction and its target as one number. candle-nn's `mse` is several operations, each
+//! with a pass over all pixels and a tensor of its own; here the value takes one pass, with a sum in f64, and so does the gradient.
 // `pulp` compiles a closure with vector instructions; that includes only functions that are inlined into it.
 #![allow(clippy::inline_always)]
 

@@ -1,4 +1,5 @@
-//! The loss of a mask: how far logits are from whether each pixel belongs to it.
+//! The loss of a mask: how far logits are from whether each pixel belongs to it. candle-nn's binary cross entropy takes
+//! the logarithm of a probability, which is infinite for a large logit; this one is finite for all.
 
 use candle_core::{Shape, Tensor};
 

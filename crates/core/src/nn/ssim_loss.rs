@@ -1,7 +1,7 @@
 //! The structural similarity (Wang et al. 2004) as a loss: 1 minus its mean over all pixels.
 //!
 //! The same measure as [`crate::frame::quality::ssim`]. Its gradient is written by hand, since it is then one pass of blurs
-//! back as it is one forward.
+//! back as it is one forward. candle-nn has no such loss.
 
 use candle_core::{Result, Shape, Tensor};
 use rayon::prelude::*;

@@ -92,9 +92,9 @@ impl Calibration {
         broken.map_or(Ok(()), |(_, rule)| Err(format!("calibration.{rule}")))
     }
 
-    /// How far what a prediction is made from is from the training data: the frames, whether they fit the state's pose, and
-    /// values of the state and of the actions (step by step) out of their ranges. 5 % of the training contexts have about 1 or
-    /// more. A state that is not known says nothing.
+    /// The distance of these inputs from the training data. It grows if the frames are unusual, if they do not fit the state's
+    /// pose, or if state or actions (of any step) leave their ranges. 5 % of the training contexts have about 1 or more. A state
+    /// that is not known adds nothing.
     #[must_use]
     pub fn distance(
         &self,
@@ -137,7 +137,7 @@ impl ValueRange {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct StepErrors {
-    /// Of the logarithm.
+    /// The constant term of the error's logarithm.
     pub intercept: f32,
     /// One for each of the [`ERROR_INPUTS`].
     pub weights: Vec<f32>,
@@ -297,7 +297,7 @@ impl RolloutInContext<'_> {
     }
 }
 
-/// Of values times the rows of a matrix.
+/// The length of the vector of `values` times the rows of a matrix.
 fn whitened_length(whitening: &[Vec<f32>], values: &[f64]) -> f64 {
     let squares = whitening.iter().map(|row| weighted_sum(row, values).powi(2));
     squares.sum::<f64>().sqrt()

@@ -1,5 +1,5 @@
 //! Loads a model from its files. Hash, tensor names and shapes are checked before the model is built. Other programs that
-//! read safetensors can load the same file; `models/README.md` lists the tensors.
+//! read safetensors can load the same file; `docs/dense-network.md` lists the tensors of the dense network.
 
 use std::collections::{BTreeMap, HashMap};
 use std::path::Path;

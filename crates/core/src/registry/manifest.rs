@@ -54,7 +54,7 @@ pub struct Manifest {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DatasetStamp {
-    /// Its name.
+    /// Its title: any text, also the names of several data sets.
     pub name: String,
     /// SHA-256 of its content.
     pub content_hash: String,
@@ -81,7 +81,7 @@ impl DatasetStamp {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DatasetShare {
-    /// Its name.
+    /// Its title: any text.
     pub name: String,
     /// SHA-256 of its content.
     pub content_hash: String,

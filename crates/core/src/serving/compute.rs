@@ -91,14 +91,22 @@ fn compute(loaded: &Model, tasks: &[&Task]) -> Result<Vec<Prediction>, Failure> 
 fn encode(loaded: &Model, tasks: &[&Task]) -> Result<Vec<Features>, Failure> {
     let spec = loaded.spec();
     let frames = tasks.iter().flat_map(|task| &task.frames);
-    let values: Vec<Vec<f32>> = frames.map(|frame| spec.preprocess.forward(frame)).collect();
-    if values.is_empty() {
+    let frames = frames.map(|frame| spec.preprocess.forward(frame));
+    if spec.keeps_frames() {
+        return Ok(frames.map(Features::from).collect());
+    }
+    let mut pixels = Vec::new();
+    frames.for_each(|frame| pixels.extend(frame));
+    if pixels.is_empty() {
         return Ok(Vec::new());
     }
-    let frames = Tensor::from_vec(values.concat(), (values.len(), spec.pixels()), &Device::Cpu)?;
-    let features = loaded.network.encode_frames(&frames)?;
+    let shape = (pixels.len() / spec.pixels(), spec.pixels());
+    let features = loaded
+        .network
+        .encode_frames(&Tensor::from_vec(pixels, shape, &Device::Cpu)?)?;
     Ok(with_values(&features, |values| {
-        values.chunks_exact(spec.code_len()).map(Features::from).collect()
+        let of_frames = values.chunks_exact(spec.code_len());
+        of_frames.map(|features| Features::from(features.to_vec())).collect()
     })?)
 }
 
@@ -120,7 +128,7 @@ impl<'a> Windows<'a> {
         let values = windows
             .iter()
             .flatten()
-            .map(AsRef::as_ref)
+            .map(|features| features.as_slice())
             .collect::<Vec<&[f32]>>()
             .concat();
         let contexts = match &loaded.manifest.calibration {

@@ -116,14 +116,6 @@ impl Session {
         range_warnings(&self.model.manifest, std::slice::from_ref(&self.state.conditioning))
     }
 
-    /// The task whose context are the session's frames, without rollouts; `None` until the context is full.
-    #[doc(hidden)]
-    #[must_use]
-    pub fn context_task(&self) -> Option<Task> {
-        let is_full = self.state.frame_count() == self.model.spec().context;
-        is_full.then(|| self.state.rollout_task(Vec::new(), self.model.spec()))
-    }
-
     /// What another program or server needs to continue the session.
     #[must_use]
     pub fn snapshot(&self) -> SessionSnapshot {

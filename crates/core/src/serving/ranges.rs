@@ -29,7 +29,7 @@ pub(super) fn range_warnings(manifest: &Manifest, inputs: &[ConditioningInput]) 
     warnings
 }
 
-/// Of the channels whose indices are given.
+/// The warnings for the channels whose indices are given.
 fn warnings_of(
     kind: &str,
     (channels, indices): (&[ChannelScale], &[usize]),

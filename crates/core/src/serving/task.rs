@@ -9,8 +9,8 @@ use crate::frame::warp::CameraModel;
 use crate::registry::Manifest;
 use crate::types::RobotState;
 
-/// The features of one frame, `[F]`.
-pub type Features = Arc<[f32]>;
+/// The features of one frame, `[F]`; for the flow network its pixels, which are not copied.
+pub type Features = Arc<Vec<f32>>;
 
 /// A unit of work for the inference thread. It carries all the state that it needs.
 #[derive(Clone, Debug, Default, PartialEq)]

@@ -12,7 +12,8 @@ use foreframe_sim::{CameraConfig, TrialParameters, WorldConfig};
 /// of the metadata file.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct DatasetInfo {
-    /// Its name, for reports.
+    /// Its title, for reports: the name of its directory, or the names of its parts joined by `+`. Not a
+    /// [`DatasetName`](foreframe_core::types::DatasetName), by which the program finds a data set: a directory can have any name.
     pub name: String,
     /// The simulated scenario; none for recordings.
     pub scenario: Option<String>,
@@ -60,8 +61,8 @@ impl DatasetInfo {
         world.map(|world| &world.camera)
     }
 
-    /// The camera of an episode with this trial: that of the trial, else the one of all trials, both with their height, else the one
-    /// in the description.
+    /// The camera of an episode: the trial's own, else that of all trials, else that of the description. The first two have a
+    /// height.
     #[doc(hidden)]
     #[must_use]
     pub fn camera_of(&self, trial: Option<&TrialParameters>) -> Option<CameraModel> {

@@ -4,10 +4,9 @@ use serde::{Deserialize, Serialize};
 
 use super::{JobError, TrainSpec, datasets};
 use crate::store::Objects;
-use foreframe_core::nn::ArchitectureKind;
 use foreframe_data::dataset::DatasetInfo;
 use foreframe_train::training::TrainConfig;
-use foreframe_train::training::config::CodecStart;
+use foreframe_train::training::config::{ArchitectureConfig, CodecStart};
 
 const MIB: u64 = 1 << 20;
 /// Bytes of an f32.
@@ -156,25 +155,23 @@ const FLOW_PIXEL_VALUES: u64 = 60;
 #[must_use]
 fn training_mib(config: &TrainConfig, dataset: &DatasetInfo, held_mib: u64) -> u64 {
     let count = |value: usize| value as u64;
-    let (features, hidden) = (count(config.model.features), count(config.model.hidden));
     let pixels = u64::from(dataset.frame_width_px) * u64::from(dataset.frame_height_px);
     let frames = dataset.frame_count as u64;
-    let (codec, network) = match config.model.architecture {
-        ArchitectureKind::Dense => (
-            2 * pixels * features,
-            2 * 4 * hidden * (features + hidden) + hidden * features,
-        ),
+    let (weights, features, frame_values) = match config.model.architecture {
+        ArchitectureConfig::Dense(sizes) => {
+            let (features, hidden) = (count(sizes.features), count(sizes.hidden));
+            let codec = 2 * pixels * features;
+            let network = 2 * 4 * hidden * (features + hidden) + hidden * features;
+            let frame_values = PIXEL_VALUES * pixels + 2 * features + HIDDEN_VALUES * hidden;
+            (codec + network, features, frame_values)
+        }
         // Its weights are few beside its activations.
-        ArchitectureKind::Flow => (0, 0),
+        ArchitectureConfig::Flow(_) => (0, 0, FLOW_PIXEL_VALUES * pixels),
     };
-    let weights = VALUE * WEIGHT_COPIES * (codec + network);
+    let weights = VALUE * WEIGHT_COPIES * weights;
     let window = count(config.model.context + config.model.horizon);
     let sequence_frames = count(config.sequence.batch_size) * window;
-    let sequence_values = match config.model.architecture {
-        ArchitectureKind::Dense => PIXEL_VALUES * pixels + 2 * features + HIDDEN_VALUES * hidden,
-        ArchitectureKind::Flow => FLOW_PIXEL_VALUES * pixels,
-    };
-    let sequence = VALUE * sequence_frames * sequence_values;
+    let sequence = VALUE * sequence_frames * frame_values;
     let pretrain = VALUE * count(config.pretrain.batch_size) * (PIXEL_VALUES * pixels + features);
     let principal = match config.pretrain.start {
         CodecStart::Principal => VALUE * PRINCIPAL_COPIES * PRINCIPAL_FRAMES.min(frames) * pixels,

@@ -46,15 +46,10 @@ impl Jobs {
         Ok(Self { shared, runner })
     }
 
-    /// Enqueues a job without an API key. Errors: as [`Self::submit_as`].
-    pub async fn submit(&self, spec: JobSpec, key: Option<String>) -> Result<Job, JobError> {
-        self.submit_as("", spec, key).await
-    }
-
-    /// Enqueues a job of the API key with the id `submitter`. If a job was enqueued with the same idempotency key before,
-    /// returns that job. Errors: what [`JobExecutor::check`] refuses, `QueueFull`, `ShareFull`, `Taken`, `Stopping`, `Invalid`,
-    /// `Store`.
-    pub async fn submit_as(&self, submitter: &str, spec: JobSpec, key: Option<String>) -> Result<Job, JobError> {
+    /// Enqueues a job of the API key with the id `submitter`, which is empty without a key. If a job was enqueued with the same
+    /// idempotency key before, returns that job. Errors: what [`JobExecutor::check`] refuses, `QueueFull`, `ShareFull`, `Taken`,
+    /// `Stopping`, `Invalid`, `Store`.
+    pub async fn submit(&self, submitter: &str, spec: JobSpec, key: Option<String>) -> Result<Job, JobError> {
         let shared = &self.shared;
         if shared.is_stopping() {
             return Err(JobError::Stopping);

@@ -246,7 +246,7 @@ async fn in_time<T>(answer: impl Future<Output = object_store::Result<T>>) -> ob
     tokio::time::timeout(QUESTION_LIMIT, answer).await.unwrap_or_else(late)
 }
 
-/// An error that may pass.
+/// A transient error: the same call can succeed later.
 fn broken(reason: String) -> object_store::Error {
     object_store::Error::Generic {
         store: "object store",

@@ -29,7 +29,7 @@ struct ActionMeasurements {
     errors: Vec<VariantErrors>,
     /// The share of the plans that each context identifies.
     plans: Vec<Option<f64>>,
-    /// Of each moment of a recording, how many plans are as good as the driven one.
+    /// For each moment of a recording, how many plans are as good as the driven one.
     ranking: Vec<Vec<usize>>,
 }
 

@@ -26,11 +26,11 @@ pub enum Method {
     PlaneSweep,
     /// The moving object cut out of the last frame and moved on at constant velocity over the background.
     MovingCutOut,
-    /// The weighted mean of the futures of the 8 training windows whose inputs, and actions to come, differ least.
+    /// The weighted mean of the frames that follow in the 8 training windows whose inputs, and actions to come, differ least.
     NearestWindows,
     /// Black frames; only for benchmarks whose frames are mostly black.
     Black,
-    /// The true future frame through the model's own frame encoder and decoder: about the best it can draw. It reads
+    /// The true frame through the model's own frame encoder and decoder: about the best it can draw. It reads
     /// them smoothed; a prediction that learnt to sharpen can come out better.
     CodecOnly,
 }

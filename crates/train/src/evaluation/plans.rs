@@ -1,6 +1,6 @@
-//! Plan identification: does the model tell what each of several plans would lead to? The simulator branches at a
-//! context into one true future for each plan; the model predicts one for each. Counted is how often a true future is
-//! nearest to the prediction of its own plan.
+//! Plan identification: does the model tell what each of several plans would lead to? The simulator carries each plan out from the
+//! same context, which gives the true frames; the model predicts the frames of each. Counted is how often the true frames after a
+//! plan are nearest to the prediction for it.
 
 use rand::Rng;
 use rayon::prelude::*;
@@ -37,14 +37,14 @@ pub enum PlanOutcome {
     },
 }
 
-/// How often the true future of a plan is nearest to the prediction for that plan.
+/// How often the true frames after a plan are nearest to the prediction for that plan.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct PlanIdentification {
     /// Contexts at which the simulator branched.
     pub contexts: usize,
     /// Plans at each context.
     pub plans: usize,
-    /// Share of the true futures that are nearest to their own plan's prediction.
+    /// Share of the plans whose true frames are nearest to their own prediction.
     pub rate: f64,
     /// Its 95 % bootstrap interval over trials; absent with fewer than two trials.
     pub interval: Option<Interval>,
@@ -52,8 +52,8 @@ pub struct PlanIdentification {
     pub chance: f64,
 }
 
-/// The true futures of a context, one for each plan; each `horizon` frames, 0…1. None if the replay differs.
-type Futures = Option<Vec<Vec<f32>>>;
+/// The true frames of a context under each plan; each `horizon` frames, 0…1. None if the replay differs.
+type TrueFrames = Option<Vec<Vec<f32>>>;
 
 /// The contexts at which plans are compared, with the plans: its own first.
 fn contexts(windows: &[Window], seed: Seed) -> Vec<(Window, Vec<Window>)> {
@@ -77,7 +77,7 @@ fn why_skipped(dataset: &Dataset, windows: &[Window]) -> Option<&'static str> {
     (!windows.iter().all(drives)).then_some("the camera stands still in this scenario, whatever the plan")
 }
 
-/// For each context the share of the futures that a model which takes actions identifies; `None` if the simulator does not
+/// For each context the share of the plans that a model which takes actions identifies; `None` if the simulator does not
 /// reproduce the context, and nothing if plans cannot be compared. Errors: those of the network and the simulator, `Cancelled`.
 pub(super) fn identify(
     evaluation: &EvaluationContext,
@@ -94,18 +94,18 @@ pub(super) fn identify(
         ..evaluation.pass(EvaluationStage::Plans)
     };
     evaluation.in_divided_batches(pass, &contexts(windows, config.seed), |contexts| {
-        let futures = contexts.par_iter();
-        let futures = futures.map(|(context, plans)| futures_of(inference, world, *context, plans));
-        let Some(futures) = futures.collect::<Result<Option<Vec<_>>, EvaluationError>>()? else {
+        let truths = contexts.par_iter();
+        let truths = truths.map(|(context, plans)| true_frames_of(inference, world, *context, plans));
+        let Some(truths) = truths.collect::<Result<Option<Vec<_>>, EvaluationError>>()? else {
             return Ok(vec![None; contexts.len()]);
         };
         let repeated: Vec<Window> = contexts.iter().flat_map(|&(context, _)| [context; PLANS]).collect();
         let plans: Vec<Window> = contexts.iter().flat_map(|(_, plans)| plans).copied().collect();
         let predicted = inference.predict(&repeated, ActionSource::OfWindows(&plans))?.frames;
         let predicted = predicted.par_chunks_exact(PLANS * spec.horizon * spec.pixels());
-        let shares = predicted.zip(&futures);
+        let shares = predicted.zip(&truths);
         Ok(shares
-            .map(|(predicted, futures)| Some(share_identified(spec, predicted, futures)))
+            .map(|(predicted, truths)| Some(share_identified(spec, predicted, truths)))
             .collect())
     })
 }
@@ -149,39 +149,39 @@ fn plans_of(own: Window, windows: &[Window], seed: Seed) -> Vec<Window> {
 }
 
 /// Replays the trial up to the context's last frame, once for each plan, and carries the plan out.
-fn futures_of(
+fn true_frames_of(
     inference: Inference,
     world: &WorldConfig,
     context: Window,
     plans: &[Window],
-) -> Result<Futures, EvaluationError> {
+) -> Result<TrueFrames, EvaluationError> {
     let spec = inference.spec();
-    let mut futures = Vec::with_capacity(plans.len());
+    let mut truths = Vec::with_capacity(plans.len());
     for plan in plans {
         let Some(mut branch) = replayed(inference, world, context)? else {
             return Ok(None);
         };
         let first_action = plan.first_frame + spec.context - 1;
-        let mut future = Vec::with_capacity(spec.horizon * spec.pixels());
+        let mut truth = Vec::with_capacity(spec.horizon * spec.pixels());
         for frame in first_action..first_action + spec.horizon {
             let result = branch.step(&action(inference.dataset, frame)?)?;
-            future.extend(scale(result.observation.frame.pixels()));
+            truth.extend(scale(result.observation.frame.pixels()));
         }
-        futures.push(future);
+        truths.push(truth);
     }
-    Ok(Some(futures))
+    Ok(Some(truths))
 }
 
-/// The share of the futures whose own prediction is the nearest.
-fn share_identified(spec: &ModelSpec, predicted: &[f32], futures: &[Vec<f32>]) -> f64 {
+/// The share of the plans whose true frames are nearest to their own prediction.
+fn share_identified(spec: &ModelSpec, predicted: &[f32], truths: &[Vec<f32>]) -> f64 {
     let predicted = predicted.chunks_exact(spec.horizon * spec.pixels());
     let predicted: Vec<Vec<f32>> = predicted.map(|frames| spec.preprocess.inverse(frames)).collect();
     let is_own = |&plan: &usize| {
-        let error = |other: usize| quality::mse(&predicted[other], &futures[plan]);
+        let error = |other: usize| quality::mse(&predicted[other], &truths[plan]);
         let own = error(plan);
         (0..predicted.len()).all(|other| other == plan || own < error(other))
     };
-    (0..futures.len()).filter(is_own).count() as f64 / futures.len().max(1) as f64
+    (0..truths.len()).filter(is_own).count() as f64 / truths.len().max(1) as f64
 }
 
 #[cfg(test)]
@@ -189,7 +189,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_future_counts_only_if_its_own_prediction_is_nearest() {
+    fn a_plan_counts_only_if_its_own_prediction_is_nearest() {
         let spec = ModelSpec {
             frame_width_px: 1,
             frame_height_px: 1,
@@ -200,11 +200,11 @@ mod tests {
             },
             ..ModelSpec::default()
         };
-        let futures = [vec![0.1, 0.1], vec![0.5, 0.5], vec![0.9, 0.9]];
-        assert_eq!(share_identified(&spec, &[0.1, 0.2, 0.5, 0.4, 0.8, 0.9], &futures), 1.0);
-        assert!((share_identified(&spec, &[0.5, 0.5, 0.1, 0.1, 0.9, 0.9], &futures) - 1.0 / 3.0).abs() < 1e-9);
+        let truths = [vec![0.1, 0.1], vec![0.5, 0.5], vec![0.9, 0.9]];
+        assert_eq!(share_identified(&spec, &[0.1, 0.2, 0.5, 0.4, 0.8, 0.9], &truths), 1.0);
+        assert!((share_identified(&spec, &[0.5, 0.5, 0.1, 0.1, 0.9, 0.9], &truths) - 1.0 / 3.0).abs() < 1e-9);
         assert_eq!(
-            share_identified(&spec, &[0.5; 6], &futures),
+            share_identified(&spec, &[0.5; 6], &truths),
             0.0,
             "equal predictions identify nothing"
         );

@@ -1,4 +1,4 @@
-//! Would a planner choose what was driven? A recording has one future, that of its own actions. Where its actions
+//! Would a planner choose what was driven? A recording shows only what followed on its own actions. Where its actions
 //! change most, the camera's picture at the end is taken as a goal image: among the driven plan, the same mirrored, and plans of other
 //! windows, how often does the model predict that picture best under the driven one?
 
@@ -18,7 +18,7 @@ use foreframe_data::dataset::Window;
 const RANKINGS: [(usize, usize); 2] = [(8, 1), (64, 5)];
 /// Plans that are predicted for each moment: enough for the largest ranking.
 const PLANS: usize = RANKINGS[1].0;
-/// One of so many windows is a moment: those in which the actions change most.
+/// A quarter of the windows are moments: those in which the actions change most.
 const MOMENT_SHARE: usize = 4;
 /// Moments at most.
 const MAX_MOMENTS: usize = 120;
@@ -34,12 +34,12 @@ pub struct PlanRanking {
     pub rates: Vec<RankingRate>,
 }
 
-/// The same, among so many plans.
+/// The ranking among a given number of plans.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct RankingRate {
     /// Plans that were compared.
     pub plans: usize,
-    /// So many first places count.
+    /// A rank up to this one counts.
     pub top: usize,
     /// The share of the moments.
     pub rate: f64,

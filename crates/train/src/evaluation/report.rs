@@ -90,7 +90,7 @@ impl EvaluationReport {
 /// What was evaluated, how and where.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ReportStamp {
-    /// The data set's name.
+    /// The data set's title.
     pub dataset: String,
     /// SHA-256 of its content.
     pub dataset_content_hash: String,

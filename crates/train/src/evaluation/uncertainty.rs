@@ -35,7 +35,7 @@ pub struct UncertaintyScores {
 /// How well novelty tells another data set from the windows of the evaluation.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct NoveltyScores {
-    /// The other data set's name.
+    /// The other data set's title.
     pub dataset: String,
     /// Its windows.
     pub windows: usize,
@@ -79,7 +79,7 @@ fn is_inside(forecast: &Forecast, step: usize) -> bool {
     (f64::from(expected.low)..=f64::from(expected.high)).contains(&forecast.errors[step])
 }
 
-/// Of the logarithms of the expected and the true errors of a step.
+/// The correlation of the logarithms of the expected and the true errors of a step.
 fn correlation(found: &[Forecast], step: usize) -> f64 {
     let pair = |forecast: &Forecast| {
         let expected = f64::from(forecast.expected[step].mse);

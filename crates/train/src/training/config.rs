@@ -1,19 +1,18 @@
 //! The configuration of a training: all settings. `checks` has their ranges.
 
 mod checks;
+mod model;
+
+pub use model::{ArchitectureConfig, ModelConfig};
 
 use serde::{Deserialize, Serialize};
 
 use super::TrainError;
 use super::observer::TrainingStage;
 use super::optimizer::{OptimizerConfig, UpdateRule};
-use foreframe_core::frame::preprocess::Preprocess;
 use foreframe_core::frame::warp::CameraModel;
 use foreframe_core::nn::loss::Loss;
-use foreframe_core::nn::{
-    Architecture, ArchitectureKind, ChannelScale, Conditioning, DenseSpec, FlowLayers, FlowSpec, ModelSpec,
-    PredictorOutput, Reconstruction,
-};
+use foreframe_core::nn::{Architecture, ChannelScale, FlowSpec, ModelSpec};
 use foreframe_core::types::{Channel, ModelName, Seed};
 use foreframe_data::dataset::{Dataset, sampler::WindowShape};
 
@@ -40,50 +39,6 @@ pub struct TrainConfig {
     /// Settings of both stages.
     #[doc(hidden)]
     pub run: RunConfig,
-}
-
-/// Settings of the network. The other values of the [`ModelSpec`] come from the data set.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct ModelConfig {
-    /// The kind of network.
-    #[serde(default = "ArchitectureKind::dense")]
-    pub architecture: ArchitectureKind,
-    /// Number of context frames.
-    pub context: usize,
-    /// Number of predicted frames.
-    pub horizon: usize,
-    /// Features of a frame (dense network).
-    #[serde(default = "default_features")]
-    pub features: usize,
-    /// Hidden units of each LSTM (dense network).
-    #[serde(default = "default_hidden")]
-    pub hidden: usize,
-    /// Which of the paper's two approaches reconstructs the context (dense network).
-    #[serde(default = "default_reconstruction")]
-    pub reconstruction: Reconstruction,
-    /// Whether the predictor gives the change of the features or the features themselves (dense network).
-    #[serde(default = "PredictorOutput::residual")]
-    pub predictor_output: PredictorOutput,
-    /// The inputs of a prediction besides the context frames.
-    pub conditioning: Conditioning,
-    /// How frames are converted to the model's value range.
-    pub preprocess: Preprocess,
-    /// Layer sizes of the flow network.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub flow: Option<FlowLayers>,
-}
-
-fn default_features() -> usize {
-    DenseSpec::default().features
-}
-
-fn default_hidden() -> usize {
-    DenseSpec::default().hidden
-}
-
-fn default_reconstruction() -> Reconstruction {
-    DenseSpec::default().reconstruction
 }
 
 /// Settings of the windows.
@@ -312,17 +267,13 @@ impl TrainConfig {
         let actions = scales(&info.action_channels, frames, |frame| dataset.action(frame));
         let states = scales(&info.state_channels, frames, |frame| dataset.state(frame));
         let architecture = match model.architecture {
-            ArchitectureKind::Dense => Architecture::Dense(DenseSpec {
-                features: model.features,
-                hidden: model.hidden,
-                reconstruction: model.reconstruction,
-                predictor_output: model.predictor_output,
-            }),
-            ArchitectureKind::Flow => Architecture::Flow(FlowSpec {
-                layers: model.flow.unwrap_or_default(),
-                camera: match model.flow {
-                    Some(layers) if layers.depth => mean_camera(dataset).or(info.camera),
-                    _ => info.camera,
+            ArchitectureConfig::Dense(dense) => Architecture::Dense(dense),
+            ArchitectureConfig::Flow(layers) => Architecture::Flow(FlowSpec {
+                layers,
+                camera: if layers.depth {
+                    mean_camera(dataset).or(info.camera)
+                } else {
+                    info.camera
                 },
             }),
         };

@@ -1,6 +1,7 @@
 //! Adam (Kingma & Ba 2015), or Muon for some weights and Adam for the others. The moments can be exported, so that a resumed
 //! training continues bit by bit. [`Gradients`] are separate values, so that parts of a batch can be computed in parallel and
-//! averaged.
+//! averaged. candle-nn's `AdamW` keeps its moments to itself, so it cannot continue from a checkpoint, and takes a pass for each
+//! operation; it has no Muon.
 // `pulp` compiles a closure with vector instructions; that includes only functions that are inlined into it.
 #![allow(clippy::inline_always)]
 
@@ -236,7 +237,7 @@ struct AdamStep {
 }
 
 impl AdamStep {
-    /// Updates the values of one tensor in one pass. candle's own operations would need a dozen passes.
+    /// Updates the values of one tensor in one pass.
     fn apply(self, parameters: &mut [f32], gradient: &[f32], moments: &mut Moments) {
         let Moments { first, second, .. } = moments;
         let (beta1, beta2) = (BETA1 as f32, BETA2 as f32);

@@ -19,7 +19,7 @@ pub(super) struct Shuffle {
 enum Order {
     /// All positions.
     Whole { count: usize },
-    /// Of each part as many positions as its share says.
+    /// From each part, as many positions as its share says.
     Mixed { parts: Vec<MixedPart> },
 }
 

@@ -7,7 +7,7 @@ use crate::server::http::extract::ResponseFormat;
 use crate::server::http::multipart::WithFrames;
 use crate::server::http::problem::ApiError;
 use crate::server::images::{ImageBytes, ImageFormat, ImageInput};
-use crate::server::plans::request::{GivenToPlanner, PlanGoal, PlanSearch, present_plan};
+use crate::server::plans::request::{GivenToPlanner, PlanGoal, PlanReading, PlanSearch, present_plan};
 use crate::server::plans::response::PlanForm;
 use crate::server::request_inputs;
 use crate::server::routes::picture;
@@ -41,7 +41,7 @@ pub(super) struct PlanRequest {
     /// How to search, and what counts.
     #[serde(default)]
     search: PlanSearch,
-    /// The plan that the robot follows now; one of the candidates, and where the search begins. Its last action is held.
+    /// The plan that the robot follows now; it is always one of the plans tried, and the search begins there. Its last action is held.
     #[serde(default)]
     present: Vec<Vec<f32>>,
     /// The action before the plan, from which `max_change` is counted first.
@@ -77,11 +77,11 @@ impl PlanRequest {
         manifest: &Manifest,
         config: &ServerConfig,
     ) -> Result<(Vec<Frame>, PlanContext, PlannerInput), ApiError> {
-        let reading = ImageInput {
+        let images = ImageInput {
             format: self.format,
             resize: self.resize,
         };
-        let frames = request_inputs::decode_frames(self.frames, reading, manifest, config.max_frames)?;
+        let frames = request_inputs::decode_frames(self.frames, images, manifest, config.max_frames)?;
         let (past_states, state) = request_inputs::states(self.state, self.states, frames.len())?;
         let seen = picture::context_for(wanted, &frames);
         let task = Task::rollout(frames, past_states, self.camera, Vec::new(), manifest)?;
@@ -91,7 +91,12 @@ impl PlanRequest {
             present: present_plan(self.present, config)?,
             action: self.action,
         };
-        let input = given.input(self.goal, self.search, reading, (manifest, config))?;
+        let reading = PlanReading {
+            images,
+            manifest,
+            config,
+        };
+        let input = given.input(self.goal, self.search, reading)?;
         Ok((seen, PlanContext::new(task), input))
     }
 }

@@ -143,7 +143,7 @@ impl WorldStepRequest {
             seq: self.step_id,
             timestamp_us: 0,
             conditioning: conditions.check(&STEP_FIELDS, manifest, max_steps)?,
-            frame: images::fit(&field, frame, observation.extra.resize, manifest)?,
+            frame: images::resized(&field, frame, observation.extra.resize, manifest)?,
             format: ImageFormat::Raw,
             is_overtaken: false,
         })

@@ -14,7 +14,7 @@ pub(super) struct ImageComponent {
     pub(super) blocks: (usize, usize),
     /// Whether a scan held its first data.
     pub(super) is_present: bool,
-    /// Of a progressive image: for each block, a bit for each coefficient that is not 0.
+    /// In a progressive image: for each block, a bit for each coefficient that is not 0.
     pub(super) nonzero: Vec<u64>,
 }
 

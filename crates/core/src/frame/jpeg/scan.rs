@@ -218,7 +218,8 @@ impl ScanPart<'_> {
     }
 }
 
-/// Reads a bit for each coefficient of `nonzero`, and passes so many others; gives the index of the next other one.
+/// Reads one bit for each coefficient in `nonzero`, and skips a given number of zero coefficients. Gives the index of the next
+/// one.
 fn pass_zeros(
     reader: &mut JpegReader<'_>,
     nonzero: u64,

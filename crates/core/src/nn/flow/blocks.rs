@@ -75,12 +75,12 @@ pub(super) fn sampled_blocks(frames: &[f32], frame_of: &[u32], places: &[f32], s
     )
 }
 
-/// Of a scene `[M, H/2, W/2, SCENE_CHANNELS]` the content: 2×2 blocks of pixels `[M, H/2, W/2, 4]`.
+/// The content of a scene `[M, H/2, W/2, SCENE_CHANNELS]`: 2×2 blocks of pixels `[M, H/2, W/2, 4]`.
 pub(super) fn content_blocks(scene: &Tensor) -> Result<Tensor> {
     scene.narrow(3, SCENE_FEATURES, SCENE_CHANNELS - SCENE_FEATURES)
 }
 
-/// Of a scene the content as frames `[M, P]`.
+/// The content of a scene as frames `[M, P]`.
 pub(super) fn content_frames(scene: &Tensor) -> Result<Tensor> {
     pixel_shuffle(&content_blocks(scene)?)?.flatten_from(1)
 }

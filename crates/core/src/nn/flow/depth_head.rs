@@ -86,7 +86,7 @@ impl SeenPlaces {
         }
     }
 
-    /// What the step's state is made of beside the moved features, `[M, H/4, W/4, MIXED_VALUES]`.
+    /// The other inputs of the step's state, beside the moved features, `[M, H/4, W/4, MIXED_VALUES]`.
     pub(super) fn beside_features(
         &self,
         views: &DepthViews,

@@ -1,7 +1,8 @@
-//! What the encoder reads to estimate depth: the context's frames in the view of the last one, as far as that can be known
-//! before the depth is, and how much each would shift if things were farther away.
+//! The encoder's inputs for depth: the context's frames, moved into the view of the last one with a first guess of the depth, and
+//! how much each would shift at a greater depth.
 //!
-//! Frames are counted from the last frame's mean in its spread, so that a darker or brighter room looks the same.
+//! Subtracts the last frame's mean from all frames and divides by its standard deviation, so that a darker or brighter room
+//! looks the same.
 // A closure's vector instructions reach what is inlined into it, and only that.
 #![allow(clippy::inline_always)]
 

@@ -37,9 +37,8 @@ impl EncoderViews<'_> {
         4 * (frames_read + 1) + 2
     }
 
-    /// The encoder's inputs `[contexts, H/2, W/2, channels]`: blocks of the last frames, the earlier ones turned into the
-    /// last one's view by the measured yaw rate, and of what the scene looks like without what moves (`seen`,
-    /// `[contexts, H/2, W/2, 4]`).
+    /// The inputs of the encoder `[contexts, H/2, W/2, channels]`: blocks of the last frames, then of the scene without movers
+    /// (`seen`, `[contexts, H/2, W/2, 4]`). Earlier frames are turned into the last one's view by the measured yaw rate.
     pub(super) fn inputs(&self, camera: Option<CameraModel>, seen: &[f32]) -> Vec<f32> {
         let size = self.spec.image_size();
         let (half, pixels) = (size.shrunk(2), size.pixels());

@@ -27,7 +27,7 @@ pub(super) struct RolloutRows<'a> {
     states: Vec<f32>,
     /// `[N, context - 1, S]`; empty where they are not known.
     past_states: Vec<f32>,
-    /// Of each rollout; empty where the model's counts.
+    /// The camera of each rollout; empty where the model's counts.
     cameras: Vec<CameraModel>,
     /// The channels of the state that the layers read.
     read: Vec<usize>,

@@ -111,7 +111,7 @@ impl<'a> BorderedConvolution<'a> {
         }
     }
 
-    /// Of one item.
+    /// Computes one item.
     fn forward(&mut self, x: &[f32], out: &mut [f32], start: StartSums, written: Written) {
         self.write(x, written);
         let ImageGeometry { channels, shape, .. } = self.image;

@@ -319,7 +319,7 @@ mod tests {
                 composition(with_room).compose(&tensors[0], &tensors[1], &inputs[2])
             });
             if !with_room {
-                // Of the mask's dependence on the place nothing is passed on; inside the frame there is none.
+                // No gradient passes through the mask to the place; inside the frame there is none.
                 assert_gradients(&inputs[2..], 1e-4, |tensors| {
                     composition(with_room).compose(&inputs[0], &inputs[1], &tensors[0])
                 });

@@ -222,7 +222,7 @@ impl Product<'_> {
     }
 }
 
-/// The sums with the products of each place's inputs, which are as many as the weights.
+/// Adds, for each place, the products of its inputs with the weights. There are as many inputs as weights.
 #[inline(always)]
 fn with_products<S: Simd, const PLACES: usize, const VECTORS: usize>(
     simd: S,

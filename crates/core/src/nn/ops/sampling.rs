@@ -196,6 +196,7 @@ impl FusedOperation<1> for FeatureSampling {
         if count != size.pixels() * items || self.image_of.iter().any(|&image| image as usize >= images) {
             bail!("{count} places do not fit {images} images of {width}×{height}");
         }
+        let of_place = |place: usize| place * channels..(place + 1) * channels;
         let mut out = vec![0.0; count * channels];
         vectorized(
             #[inline(always)]
@@ -203,7 +204,9 @@ impl FusedOperation<1> for FeatureSampling {
                 self.visit(
                     size,
                     #[inline(always)]
-                    |index, pixel, share| add_scaled(&mut out, index, features.values, pixel, (channels, share)),
+                    |index, pixel, share| {
+                        add_scaled(&mut out[of_place(index)], &features.values[of_place(pixel)], share);
+                    },
                 );
             },
         );
@@ -212,6 +215,7 @@ impl FusedOperation<1> for FeatureSampling {
 
     fn backward(&self, [features]: [Operand; 1], _output: Operand, gradient: Operand) -> Result<[Option<Vec<f32>>; 1]> {
         let (_, height, width, channels) = features.layout.shape().dims4()?;
+        let of_place = |place: usize| place * channels..(place + 1) * channels;
         let mut sums = vec![0.0; features.values.len()];
         vectorized(
             #[inline(always)]
@@ -219,7 +223,9 @@ impl FusedOperation<1> for FeatureSampling {
                 self.visit(
                     ImageSize { height, width },
                     #[inline(always)]
-                    |index, pixel, share| add_scaled(&mut sums, pixel, gradient.values, index, (channels, share)),
+                    |index, pixel, share| {
+                        add_scaled(&mut sums[of_place(pixel)], &gradient.values[of_place(index)], share);
+                    },
                 );
             },
         );
@@ -227,11 +233,10 @@ impl FusedOperation<1> for FeatureSampling {
     }
 }
 
-/// Adds the channels of the place `from` of `values`, times `share`, to those of the place `to` of `sums`.
+/// Adds `share` times the values to the sums.
 #[inline(always)]
-fn add_scaled(sums: &mut [f32], to: usize, values: &[f32], from: usize, (channels, share): (usize, f32)) {
-    let values = &values[from * channels..(from + 1) * channels];
-    for (sum, value) in sums[to * channels..(to + 1) * channels].iter_mut().zip(values) {
+fn add_scaled(sums: &mut [f32], values: &[f32], share: f32) {
+    for (sum, value) in sums.iter_mut().zip(values) {
         *sum += share * value;
     }
 }

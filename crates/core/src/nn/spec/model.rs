@@ -108,6 +108,12 @@ impl ModelSpec {
         }
     }
 
+    /// Whether the code of a frame is the frame itself, in the model's value range.
+    #[must_use]
+    pub(crate) fn keeps_frames(&self) -> bool {
+        matches!(self.architecture, Architecture::Flow(_))
+    }
+
     /// Height and width of a frame.
     pub(in crate::nn) fn image_size(&self) -> ImageSize {
         ImageSize {

@@ -50,7 +50,7 @@ impl ContextStatistics {
         }
     }
 
-    /// Of windows whose frames have these codes, `frames` for each window, oldest first. What the codes do not hold, the
+    /// The statistics of windows whose frames have these codes, `frames` for each window, oldest first. What the codes do not hold, the
     /// statistics do not see. Errors: those of the network.
     #[doc(hidden)]
     pub fn of_codes(model: &Network, codes: &[f32], frames: usize) -> Result<Vec<Self>, NnError> {

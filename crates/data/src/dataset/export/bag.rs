@@ -8,6 +8,7 @@ use super::cdr::CdrWriter;
 use super::mcap::McapWriter;
 use crate::dataset::store::files::write_whole;
 use crate::dataset::{Dataset, DatasetError};
+use foreframe_core::frame::FrameSize;
 use foreframe_core::frame::warp::CameraModel;
 use foreframe_core::types::Channel;
 
@@ -74,7 +75,10 @@ fn write(dataset: &Dataset, episodes: &[Range<usize>], mut bag: McapWriter<'_>) 
             values.push((bag.topic(name, type_name, &definition), kind, row));
         }
     }
-    let size = (info.frame_width_px, info.frame_height_px);
+    let size = FrameSize {
+        width: info.frame_width_px,
+        height: info.frame_height_px,
+    };
     let period_ns = info.frame_period_s * 1e9;
     let mut start_ns = START_NS;
     for (episode, camera) in episodes.iter().zip(cameras) {
@@ -191,9 +195,9 @@ fn image_definition() -> String {
     definition(own, &[])
 }
 
-fn gray_image(time_ns: u64, (width, height): (u32, u32), pixels: &[u8]) -> Vec<u8> {
-    let size = CdrWriter::new().header(time_ns).u32s(&[height, width]);
-    size.text("mono8").u8(0).u32(width).bytes(pixels).end()
+fn gray_image(time_ns: u64, size: FrameSize, pixels: &[u8]) -> Vec<u8> {
+    let head = CdrWriter::new().header(time_ns).u32s(&[size.height, size.width]);
+    head.text("mono8").u8(0).u32(size.width).bytes(pixels).end()
 }
 
 fn camera_definition() -> String {
@@ -203,11 +207,12 @@ fn camera_definition() -> String {
 }
 
 /// A camera without distortion, whose axis goes through the middle of the image.
-fn camera_info(time_ns: u64, (width, height): (u32, u32), horizontal_fov_rad: f32) -> Vec<u8> {
+fn camera_info(time_ns: u64, size: FrameSize, horizontal_fov_rad: f32) -> Vec<u8> {
+    let FrameSize { width, height } = size;
     let focal_px = f64::from(width) / 2.0 / (f64::from(horizontal_fov_rad) / 2.0).tan();
     let (middle_x, middle_y) = (f64::from(width) / 2.0, f64::from(height) / 2.0);
-    let size = CdrWriter::new().header(time_ns).u32s(&[height, width]);
-    size.text("plumb_bob")
+    let head = CdrWriter::new().header(time_ns).u32s(&[height, width]);
+    head.text("plumb_bob")
         .f64_sequence(&[0.0; 5])
         .f64s(&[focal_px, 0.0, middle_x, 0.0, focal_px, middle_y, 0.0, 0.0, 1.0])
         .f64s(&[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0])

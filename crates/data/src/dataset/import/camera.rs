@@ -23,7 +23,7 @@ pub(super) struct RecordedProjection {
 }
 
 impl RecordedProjection {
-    /// Of images with square pixels.
+    /// The projection of images with square pixels.
     fn of_fov(fov_deg: f64, width_px: u32, height_px: u32) -> Self {
         let focal_px = f64::from(width_px) / 2.0 / (fov_deg.to_radians() / 2.0).tan();
         Self {

@@ -5,8 +5,8 @@ use std::path::PathBuf;
 use serde::Serialize;
 
 use super::error::ImportError;
-use foreframe_core::frame::MAX_SIDE_PX;
 use foreframe_core::frame::resize::Resize;
+use foreframe_core::frame::{FrameSize, MAX_SIDE_PX};
 use foreframe_core::types::Channel;
 
 /// The largest [`ImportOptions::every`].
@@ -127,11 +127,16 @@ impl Default for ImportOptions {
 }
 
 /// Width and height in pixels, written as in `64x64`. Errors: what would be right.
-pub fn parse_size(text: &str) -> Result<(u32, u32), &'static str> {
-    let sides = text
-        .split_once('x')
-        .and_then(|(width, height)| Some((width.parse().ok()?, height.parse().ok()?)));
-    sides.ok_or("write WIDTHxHEIGHT, as in 64x64")
+pub fn parse_size(text: &str) -> Result<FrameSize, &'static str> {
+    let size = |(width, height): (&str, &str)| {
+        Some(FrameSize {
+            width: width.parse().ok()?,
+            height: height.parse().ok()?,
+        })
+    };
+    text.split_once('x')
+        .and_then(size)
+        .ok_or("write WIDTHxHEIGHT, as in 64x64")
 }
 
 impl ImportOptions {

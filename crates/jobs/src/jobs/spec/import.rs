@@ -21,6 +21,8 @@ use foreframe_data::dataset::is_finished;
 /// An import: turns a recording in the server's `import_dir`, or an uploaded file, into the data set `name`. The fields are the options of
 /// `foreframe import`. A cancelled import continues where it stopped when it is resumed, or when the same import is submitted
 /// again.
+// Not `ImportOptions` flattened: serde would no longer list the known fields for one that it does not know, and the options of an
+// import that has begun are stored under the names that they have there.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ImportSpec {
@@ -195,12 +197,11 @@ impl ImportSpec {
     fn options(&self, csv: Option<PathBuf>) -> Result<ImportOptions, JobError> {
         let wrong =
             |option, value: &str, right: &str| JobError::invalid(option, format!("{value} is not valid; {right}"));
-        let size = parse_size(&self.size);
-        let (frame_width_px, frame_height_px) =
-            size.map_err(|right| wrong("size", &format!("\"{}\"", self.size.escape_default()), right))?;
+        let size = parse_size(&self.size)
+            .map_err(|right| wrong("size", &format!("\"{}\"", self.size.escape_default()), right))?;
         let options = ImportOptions {
-            frame_width_px,
-            frame_height_px,
+            frame_width_px: size.width,
+            frame_height_px: size.height,
             resize: self.resize,
             rate_hz: self.rate,
             every: self.every,

@@ -1,4 +1,4 @@
-//! The weighted mean of the futures of the training windows whose inputs, and actions to come, differ least.
+//! The weighted mean of the frames that follow in the training windows whose inputs, and actions to come, differ least.
 
 mod search;
 mod small;
@@ -58,7 +58,7 @@ impl NearestWindows {
         self.summary
     }
 
-    /// The weighted mean of the neighbours' futures. Errors: those of [`Dataset::pixels`].
+    /// The weighted mean of the neighbours' frames to predict. Errors: those of [`Dataset::pixels`].
     pub(super) fn predict(
         &self,
         dataset: &Dataset,

@@ -1,4 +1,5 @@
-//! Gray images to draw on: text from an 8×8 bitmap font, lines and discs.
+//! Gray images to draw on: text from an 8×8 bitmap font, lines and discs. Crates that write text on images read the outlines of
+//! a font file, which the program would have to carry; `font8x8` is a table of dots, and looks the same everywhere.
 
 use std::ops::Range;
 
@@ -7,6 +8,14 @@ use foreframe_core::frame::Frame;
 
 /// Side of a letter in pixels before scaling.
 const LETTER_PX: usize = 8;
+
+/// How text looks.
+#[derive(Clone, Copy)]
+pub(super) struct TextStyle {
+    /// Pixels of the canvas for each dot of a letter, to each side.
+    pub(super) scale: usize,
+    pub(super) ink: u8,
+}
 
 /// Width of a line of text in pixels.
 pub(super) fn width_px(text: &str, scale: usize) -> usize {
@@ -98,7 +107,8 @@ impl Canvas {
     }
 
     /// Writes a line of text from its top left corner. Letters that the font lacks stay blank.
-    pub(super) fn write(&mut self, (left, top): (usize, usize), text: &str, scale: usize, ink: u8) {
+    pub(super) fn write(&mut self, left: usize, top: usize, text: &str, style: TextStyle) {
+        let TextStyle { scale, ink } = style;
         for (place, letter) in text.chars().enumerate() {
             let glyph = BASIC_FONTS.get(letter).or_else(|| LATIN_FONTS.get(letter));
             for (row, bits) in glyph.into_iter().flatten().enumerate() {

@@ -2,7 +2,7 @@
 
 use std::collections::VecDeque;
 
-use super::canvas::{Canvas, height_px};
+use super::canvas::{Canvas, TextStyle, height_px};
 use super::montage::enlarged;
 use crate::evaluation::drive::{DriveError, DriveSettings, DriveStep, DriverKind, replay};
 use foreframe_core::frame::{Frame, FrameError, codec};
@@ -13,6 +13,10 @@ const PAPER: u8 = 255;
 const INK: u8 = 0;
 const GAP_PX: usize = 8;
 const LETTER_SCALE: usize = 2;
+const TEXT: TextStyle = TextStyle {
+    scale: LETTER_SCALE,
+    ink: INK,
+};
 /// A line of the caption and the gap below it.
 const LINE_PX: usize = height_px(LETTER_SCALE) + 4;
 /// Driver, episode, time, collision.
@@ -29,7 +33,7 @@ const FINE_M: f32 = 0.02;
 const LARGE_BYTES: usize = 1_500_000;
 /// From one gray value to the next: what is tried until the file is not large.
 const GRAY_STEPS: [u8; 4] = [8, 16, 32, 64];
-/// Of a longer episode, these last steps are shown: half a minute with the usual five steps a second.
+/// The most pictures in a GIF: half a minute at five steps a second. Of a longer episode, the end is shown.
 const MAX_PICTURES: usize = 150;
 
 /// Drives an episode once more, and draws each step: on the left what the camera shows, with the way of the plan on the floor and the
@@ -66,7 +70,7 @@ pub fn episode_gif(
     Ok(small_gif(&Vec::from(pictures), delay_ms, LARGE_BYTES)?)
 }
 
-/// A GIF with as many gray values as fit in that many bytes; a larger one if even the fewest do not.
+/// A GIF with as many gray values as the size limit allows. If even the fewest are too large, it exceeds the limit.
 fn small_gif(pictures: &[Frame], delay_ms: u32, large_bytes: usize) -> Result<Vec<u8>, FrameError> {
     let mut gif = Vec::new();
     for gray_step in GRAY_STEPS {
@@ -100,7 +104,7 @@ fn joined(picture: &Frame, captions: &[String], room: &Frame) -> Result<Frame, F
     canvas.paste(room, [left, GAP_PX]);
     let first = GAP_PX + picture.height() as usize + 4;
     for (line, caption) in captions.iter().enumerate() {
-        canvas.write((GAP_PX, first + line * LINE_PX), caption, LETTER_SCALE, INK);
+        canvas.write(GAP_PX, first + line * LINE_PX, caption, TEXT);
     }
     Frame::new(width as u32, height as u32, canvas.pixels)
 }

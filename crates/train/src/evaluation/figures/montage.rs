@@ -2,7 +2,7 @@
 
 use std::iter::{repeat, repeat_n};
 
-use super::canvas::{Canvas, height_px, width_px};
+use super::canvas::{Canvas, TextStyle, height_px, width_px};
 use foreframe_core::frame::{Frame, FrameError, MAX_SIDE_PX};
 
 const PAPER: u8 = 255;
@@ -10,6 +10,10 @@ const INK: u8 = 30;
 const MARGIN_PX: usize = 16;
 const GAP_PX: usize = 8;
 const LETTER_SCALE: usize = 3;
+const TEXT: TextStyle = TextStyle {
+    scale: LETTER_SCALE,
+    ink: INK,
+};
 /// A line of text and the gap below it.
 const LINE_PX: usize = height_px(LETTER_SCALE) + GAP_PX;
 /// Frames are enlarged to at least this width.
@@ -171,7 +175,7 @@ pub fn montage(title: &str, rows: &[MontageRow], style: &Style) -> Result<Frame,
     }
     let [width, height] = layout.sides()?;
     let mut canvas = Canvas::new(layout.width, layout.height, PAPER);
-    canvas.write((MARGIN_PX, MARGIN_PX), title, LETTER_SCALE, INK);
+    canvas.write(MARGIN_PX, MARGIN_PX, title, TEXT);
     let mut top = layout.top;
     for (row, row_height) in rows.iter().zip(&layout.heights) {
         draw_row(&mut canvas, row, &style, (top, layout.column));
@@ -189,7 +193,7 @@ struct Layout {
     column: usize,
     /// Below the title.
     top: usize,
-    /// Of every row.
+    /// The height of each row.
     heights: Vec<usize>,
 }
 
@@ -234,7 +238,7 @@ fn frames_height(row: &MontageRow, style: &Style) -> usize {
 
 fn draw_row(canvas: &mut Canvas, row: &MontageRow, style: &Style, (mut top, column): (usize, usize)) {
     if !row.label.is_empty() {
-        canvas.write((MARGIN_PX, top), &row.label, LETTER_SCALE, INK);
+        canvas.write(MARGIN_PX, top, &row.label, TEXT);
         top += LINE_PX;
     }
     let frames = frames_height(row, style);
@@ -242,7 +246,7 @@ fn draw_row(canvas: &mut Canvas, row: &MontageRow, style: &Style, (mut top, colu
         let left = MARGIN_PX + place * column;
         draw_frame(canvas, frame, style, (left, top));
         let indent = (column - GAP_PX).saturating_sub(width_px(caption, LETTER_SCALE)) / 2;
-        canvas.write((left + indent, top + frames + GAP_PX / 2), caption, LETTER_SCALE, INK);
+        canvas.write(left + indent, top + frames + GAP_PX / 2, caption, TEXT);
     }
 }
 

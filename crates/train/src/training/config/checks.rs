@@ -74,7 +74,8 @@ impl TrainConfig {
     /// Checks the settings that others must allow. Errors: `Config` with the first that does not fit, and what would.
     fn validate_together(&self) -> Result<(), TrainError> {
         let (run, sequence) = (&self.run, &self.sequence);
-        if self.model.architecture == ArchitectureKind::Dense {
+        let architecture = self.model.architecture.kind();
+        if architecture == ArchitectureKind::Dense {
             let dense_needs = [
                 ("run.optimizer", run.optimizer == UpdateRule::Muon, "adam"),
                 ("sequence.short_share", sequence.short_share > 0.0, "0"),
@@ -85,7 +86,7 @@ impl TrainConfig {
                 ));
             }
         }
-        if self.model.architecture == ArchitectureKind::Flow && self.pretrain.steps > 0 {
+        if architecture == ArchitectureKind::Flow && self.pretrain.steps > 0 {
             return refused(format!(
                 "pretrain.steps is {}; the flow network has no pre-training, so it must be 0",
                 self.pretrain.steps

@@ -12,15 +12,15 @@ use crate::vectorized::vectorized;
 
 /// Gradients of the backward pass.
 pub(super) struct RecurrenceGradients {
-    /// Of the sums [T · B, 4H].
+    /// The gradient of the sums [T · B, 4H].
     pub(super) sums: Vec<f32>,
-    /// Of h and c before the step, `[B, H]` each.
+    /// The gradients of h and c before the step, `[B, H]` each.
     pub(super) h: Vec<f32>,
     pub(super) c: Vec<f32>,
-    /// Of the features after each step [T · B, F], and of the features before the first step `[B, F]`.
+    /// The gradients of the features after each step [T · B, F], and of the features before the first step `[B, F]`.
     pub(super) features: Vec<f32>,
     pub(super) first: Vec<f32>,
-    /// Of the peepholes, `[H]` each.
+    /// The gradients of the peepholes, `[H]` each.
     peepholes: [Vec<f32>; 3],
 }
 

@@ -184,7 +184,7 @@ fn padding(size: u64) -> u64 {
     (BLOCK as u64 - size % BLOCK as u64) % BLOCK as u64
 }
 
-/// Reads over at most so many bytes. Errors: `Archive`.
+/// Skips `bytes` bytes, or fewer at the end. Errors: `Archive`.
 fn skip(archive: &mut impl Read, bytes: u64, to: &Unpacker<'_>) -> Result<(), ImportError> {
     let skipped = io::copy(&mut archive.take(bytes), &mut io::sink());
     skipped.map(drop).map_err(|error| broken(to, &error))

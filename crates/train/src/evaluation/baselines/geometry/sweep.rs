@@ -19,7 +19,7 @@ const UNUSUAL_COST: f32 = 1e-5;
 /// A frame before the last one.
 pub(super) struct EarlierFrame<'a> {
     pub(super) values: &'a [f32],
-    /// Of its camera, in the axes of the last frame.
+    /// The pose of its camera, in the axes of the last frame.
     pub(super) pose: PlanarPose,
 }
 

@@ -13,7 +13,7 @@ pub(super) struct SmallImages {
 }
 
 impl SmallImages {
-    /// Of frames of that size.
+    /// For frames of this size.
     pub(super) fn new(width: usize, height: usize) -> Self {
         Self {
             width,
@@ -27,8 +27,8 @@ impl SmallImages {
         self.rows.len() * self.columns.len()
     }
 
-    /// The mean of each block times the root of its number of pixels: the squared distance of two small images is at most that
-    /// of their frames, and equal to it where every block is even.
+    /// The mean of each block, times the root of its pixel count. Then the distance of two small images is never more than that
+    /// of their frames; it is equal if every block has one value.
     pub(super) fn shrink(&self, frame: &[u8], small: &mut [f32]) {
         let blocks = self
             .rows
