@@ -19,12 +19,12 @@ const LINE_EVERY: Duration = Duration::from_secs(5);
 
 /// Predict for a running robot that has a Foxglove bridge.
 ///
-/// It subscribes the robot's camera and, if the model takes them, its command and odometry. It publishes three ROS 2 topics on the robot:
+/// It subscribes to the robot's camera and, if the model takes them, its command and odometry. It publishes three ROS 2 topics on the robot:
 /// `PREFIX/predicted`, the last predicted frame with its time (a CompressedImage); `PREFIX/error`, the error of the earlier prediction for
 /// the present frame (mean squared, a Float64); `PREFIX/expected_error`, the error to expect of that last predicted frame (a
 /// Float64). Images are `sensor_msgs/msg/Image` or CompressedImage in CDR, or `foxglove.RawImage` or CompressedImage. Commands and odometry
 /// are messages of ROS 2 in CDR or JSON; a topic that is named can also have any other object in JSON, whose numbers are found by the
-/// names of the model's channels. It ends when the robot closes the connection.
+/// names of the model's channels. The program ends when the robot closes the connection.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   foreframe bridge ws://192.168.1.20:8765 --model rooms

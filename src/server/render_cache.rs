@@ -1,6 +1,6 @@
 //! Pictures and reports: made on threads of their own, so that predictions do not wait for them, and kept in a cache of
-//! bounded size. It drops what was not used for the longest time, exactly, which `quick_cache` does only about; `hashlink` comes
-//! with sqlx anyway.
+//! bounded size. It drops what was not used for the longest time; `quick_cache` does that only approximately. `hashlink` comes with
+//! sqlx anyway.
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 

@@ -38,15 +38,22 @@ fn code(text: &str) -> impl Iterator<Item = &str> {
         .filter(|line| !line.trim_start().starts_with("//"))
 }
 
-/// Whether the code has a path that begins with a crate of this name: in a `use`, an attribute, or anywhere else.
+/// Whether the code uses a crate of this name: alone in a `use`, or where a path begins, in an attribute or anywhere else.
 fn names_crate(code: &[&str], name: &str) -> bool {
     let is_name = |token: &str| match name.strip_suffix("::") {
         Some(name) => token == name,
         None => token.starts_with(name),
     };
-    let begins = |at: usize| at == 0 || code[at - 1] != ":";
+    // After `use`, `fn` or another word, two colons begin a path of their own.
+    let is_inside = |at: usize| at > 2 && code[at - 2..at] == [":", ":"] && is_word(code[at - 3]);
     let goes_on = |at: usize| code.get(at + 1..at + 3) == Some(&[":", ":"]);
-    (0..code.len()).any(|at| is_name(code[at]) && begins(at) && goes_on(at))
+    let is_whole = |at: usize| at > 0 && code[at - 1] == "use" && matches!(code.get(at + 1), Some(&(";" | "as")));
+    (0..code.len()).any(|at| is_name(code[at]) && !is_inside(at) && (goes_on(at) || is_whole(at)))
+}
+
+/// Whether a token can stand before the colons of a longer path.
+fn is_word(token: &str) -> bool {
+    token == ">" || (token.starts_with(|c: char| c.is_alphanumeric() || c == '_') && token != "use")
 }
 
 /// The files of the library and the program; the load tests are tests.
@@ -121,6 +128,8 @@ fn dependencies_are_used_only_in_their_folders() {
 fn a_crate_is_found_wherever_a_path_names_it() {
     let names = |text: &str| names_crate(&tokens(text), "zip::");
     assert!(names("use zip::ZipArchive;") && names("fn open() -> zip::Result<()> {}") && names("#[zip::main]"));
+    assert!(names("fn open(archive: zip::Archive) {}") && names("let x = ::zip::open();") && names("use ::zip::A;"));
+    assert!(names("use zip as archives;") && names("use zip;"));
     assert!(!names("use crate::zip::Archive;") && !names("values.zip(others)") && !names("zips::x()"));
     assert!(names_crate(&tokens("tokio_util::io::copy()"), "tokio"));
 }

@@ -57,8 +57,9 @@ pub(crate) fn without_tests(text: &str) -> Vec<&str> {
             continue;
         }
         // The item ends with the first line that is indented as its attribute and closes it.
-        let closes = |inner: &&str| indent(inner) == indent(line) && inner.ends_with(['}', ';', ',']);
-        lines.find(closes);
+        let code = |inner: &str| inner.split(" // ").next().unwrap_or_default().trim_end().to_owned();
+        let closes = |inner: &&str| indent(inner) == indent(line) && code(inner).ends_with(['}', ';', ',']);
+        assert!(lines.find(closes).is_some(), "an item for tests has no end");
     }
     kept
 }

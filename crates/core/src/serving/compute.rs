@@ -95,12 +95,15 @@ fn encode(loaded: &Model, tasks: &[&Task]) -> Result<Vec<Features>, Failure> {
     if spec.keeps_frames() {
         return Ok(frames.map(Features::from).collect());
     }
-    let mut pixels = Vec::new();
-    frames.for_each(|frame| pixels.extend(frame));
-    if pixels.is_empty() {
+    let (mut pixels, mut count) = (Vec::new(), 0);
+    for frame in frames {
+        pixels.extend(frame);
+        count += 1;
+    }
+    if count == 0 {
         return Ok(Vec::new());
     }
-    let shape = (pixels.len() / spec.pixels(), spec.pixels());
+    let shape = (count, spec.pixels());
     let features = loaded
         .network
         .encode_frames(&Tensor::from_vec(pixels, shape, &Device::Cpu)?)?;

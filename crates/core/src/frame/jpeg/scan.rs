@@ -218,8 +218,8 @@ impl ScanPart<'_> {
     }
 }
 
-/// Reads one bit for each coefficient in `nonzero`, and skips a given number of zero coefficients. Gives the index of the next
-/// one.
+/// Reads one bit for each coefficient in `nonzero`, and skips a given number of zero coefficients. Gives the index of the
+/// zero coefficient after them.
 fn pass_zeros(
     reader: &mut JpegReader<'_>,
     nonzero: u64,

@@ -1,6 +1,6 @@
 //! Writes MCAP files: <https://mcap.dev/spec>. Chunks without compression, with checksums and with all indexes, as
-//! `ros2 bag record` writes them. The crate `mcap` is not used: the import cannot read with it, and only for writing it would bring
-//! more crates than this file has kinds of records.
+//! `ros2 bag record` writes them. The crate `mcap` is not used: the import cannot use it (`import/bag/mcap` says why), and this
+//! file is all that writing takes.
 
 use std::fs::File;
 use std::io::{BufWriter, Write};

@@ -42,7 +42,8 @@ impl ArchitectureConfig {
 }
 
 /// The written form: one table, in which the sizes of both networks stand beside what is common. Only those of the network that
-/// `architecture` names count, so that another layer of settings can name the other one.
+/// `architecture` names count, so that `--set model.architecture=flow` can change the
+/// network of a preset.
 #[derive(Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct ModelSettings {
