@@ -143,6 +143,17 @@ fn drivers_drive_the_same_episodes() {
     assert!(error.contains("driver plan needs a model; name one"), "{error}");
 }
 
+#[test]
+fn an_episode_without_a_goal_is_drawn_again() {
+    let dir = tempfile::tempdir().unwrap();
+    // In the first room that is drawn for episode 42, the robot starts where it can go nowhere.
+    let drive = "drive --scenario crossing --rooms varied --driver pid --seed 5002 --duration 1 --episodes 43 --json";
+    let (code, said, error) = run(dir.path(), drive);
+    assert_eq!(code, Some(0), "{error}");
+    let scores: Value = serde_json::from_str(&said).unwrap();
+    assert_eq!(scores[0]["episodes"].as_array().unwrap().len(), 43);
+}
+
 /// The number of pictures of a GIF: each has one graphic control extension with the delay of a step, 200 ms.
 fn pictures(gif: &[u8]) -> usize {
     assert!(gif.starts_with(b"GIF89a"));

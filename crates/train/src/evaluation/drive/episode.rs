@@ -21,6 +21,10 @@ const ARRIVAL_M: f32 = 0.25;
 const LEAST_GOAL_M: f32 = 1.5;
 /// In `crossing`, the goal is not farther than this from straight ahead, in radians.
 const CROSSED_RAD: f32 = 0.35;
+/// Some starts leave the robot no way. Then the episode is drawn again, up to this number of draws.
+const ROOMS_TRIED: u64 = 8;
+/// From one draw's trial number to the next one's: more than there are episodes.
+const OTHER_ROOM: u64 = 1 << 32;
 /// Without a model, the robot stands for this many frames, as others stand until their model's context is full.
 const CONTEXT: usize = 5;
 /// A robot counts as seen for so long after the camera showed it, in seconds.
@@ -131,28 +135,43 @@ impl EpisodeStart {
             config.frame_period_s = spec.frame_period_s;
             context = spec.context;
         }
-        let world = World::new(settings.scenario, &config, settings.seed, episode as u64)?;
-        let seed = settings.seed.derive("goal", episode as u64);
-        // Robots cross the way ahead.
-        let aside_rad = if settings.scenario == Scenario::Crossing {
-            CROSSED_RAD
-        } else {
-            PI
-        };
-        let tries = [(LEAST_GOAL_M, aside_rad), (LEAST_GOAL_M, PI), (LEAST_GOAL_M / 2.0, PI)];
-        let goal = tries
-            .into_iter()
-            .find_map(|(least_m, aside_rad)| world.draw_goal(seed, least_m, aside_rad));
-        let own = world.parameters().room.as_ref();
-        let own = own.map(|room| room.camera.model_with_height());
-        Ok(Self {
-            goal_m: goal.ok_or(DriveError::NoGoal { episode })?,
-            camera: own.unwrap_or_else(|| config.camera.model_with_height()),
-            world,
-            context,
-            period_s: config.frame_period_s as f32,
-        })
+        for nth in 0..ROOMS_TRIED {
+            let Some((world, goal_m)) = world_with_goal(settings, &config, episode as u64 + nth * OTHER_ROOM)? else {
+                continue;
+            };
+            let own = world.parameters().room.as_ref();
+            let own = own.map(|room| room.camera.model_with_height());
+            return Ok(Self {
+                goal_m,
+                camera: own.unwrap_or_else(|| config.camera.model_with_height()),
+                world,
+                context,
+                period_s: config.frame_period_s as f32,
+            });
+        }
+        Err(DriveError::NoGoal { episode })
     }
+}
+
+/// A trial's world and a goal that the robot can reach there; `None` if there is no such goal.
+fn world_with_goal(
+    settings: &DriveSettings,
+    config: &WorldConfig,
+    trial: u64,
+) -> Result<Option<(World, [f32; 2])>, DriveError> {
+    let world = World::new(settings.scenario, config, settings.seed, trial)?;
+    let seed = settings.seed.derive("goal", trial);
+    // Robots cross the way ahead.
+    let aside_rad = if settings.scenario == Scenario::Crossing {
+        CROSSED_RAD
+    } else {
+        PI
+    };
+    let tries = [(LEAST_GOAL_M, aside_rad), (LEAST_GOAL_M, PI), (LEAST_GOAL_M / 2.0, PI)];
+    let goal = tries
+        .into_iter()
+        .find_map(|(least_m, aside_rad)| world.draw_goal(seed, least_m, aside_rad));
+    Ok(goal.map(|goal| (world, goal)))
 }
 
 /// Drives an episode. `on_step` is called after each step, and after the choice of the next command.

@@ -51,8 +51,10 @@ pub enum DriveError {
         /// The model.
         model: ModelName,
     },
-    /// No episode has a goal.
-    #[error("episode {episode} has no place that the robot can drive to")]
+    /// None of the rooms that were drawn for an episode has a goal.
+    #[error(
+        "episode {episode} has no place that the robot can drive to in any of the rooms drawn for it; choose another seed"
+    )]
     NoGoal {
         /// The episode.
         episode: usize,
