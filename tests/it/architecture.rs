@@ -1,7 +1,7 @@
 //! The order of the source: crates are layers, which the compiler keeps apart; within a crate no files or folders use each
 //! other in a circle; and some dependencies are used only in certain folders.
 
-use crate::source_graph::{SourceFile, circles, source_files, tokens, uses, without_tests};
+use crate::source_graph::{SourceFile, circles, goes_on_a_path, source_files, tokens, uses, without_tests};
 
 /// The folders in which a dependency may be used. Without `::`, every crate whose name begins so.
 const USED_IN: &[(&str, &[&str])] = &[
@@ -44,16 +44,9 @@ fn names_crate(code: &[&str], name: &str) -> bool {
         Some(name) => token == name,
         None => token.starts_with(name),
     };
-    // After `use`, `fn` or another word, two colons begin a path of their own.
-    let is_inside = |at: usize| at > 2 && code[at - 2..at] == [":", ":"] && is_word(code[at - 3]);
     let goes_on = |at: usize| code.get(at + 1..at + 3) == Some(&[":", ":"]);
     let is_whole = |at: usize| at > 0 && code[at - 1] == "use" && matches!(code.get(at + 1), Some(&(";" | "as")));
-    (0..code.len()).any(|at| is_name(code[at]) && !is_inside(at) && (goes_on(at) || is_whole(at)))
-}
-
-/// Whether a token can stand before the colons of a longer path.
-fn is_word(token: &str) -> bool {
-    token == ">" || (token.starts_with(|c: char| c.is_alphanumeric() || c == '_') && token != "use")
+    (0..code.len()).any(|at| is_name(code[at]) && !goes_on_a_path(code, at) && (goes_on(at) || is_whole(at)))
 }
 
 /// The files of the library and the program; the load tests are tests.

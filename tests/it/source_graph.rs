@@ -104,6 +104,12 @@ pub(crate) fn tokens(text: &str) -> Vec<&str> {
     found
 }
 
+/// Whether the token goes on a path: two colons stand before it, and the end of a name before them. `use ::zip` begins one.
+pub(crate) fn goes_on_a_path(tokens: &[&str], at: usize) -> bool {
+    let ends_name = |token: &str| token == ">" || (token != "use" && is_name(token));
+    at > 2 && tokens[at - 2..at] == [":", ":"] && ends_name(tokens[at - 3])
+}
+
 /// The bytes of the string literal that begins here.
 fn string_length(text: &str) -> usize {
     let mut is_escaped = false;
@@ -204,9 +210,7 @@ fn names(module: &Module, text: &str, files: &BTreeMap<Module, SourceFile>) -> N
                 }
                 at += length;
             }
-            first
-                if tokens.get(at + 1..at + 3) == Some(&[":", ":"]) && tokens.get(at.wrapping_sub(1)) != Some(&":") =>
-            {
+            first if tokens.get(at + 1..at + 3) == Some(&[":", ":"]) && !goes_on_a_path(&tokens, at) => {
                 let mut path = vec![first.to_owned()];
                 while tokens.get(at + 1..at + 3) == Some(&[":", ":"])
                     && tokens.get(at + 3).is_some_and(|name| is_name(name))

@@ -154,7 +154,7 @@ impl SessionState {
             past_states: past_states.into(),
             camera: snapshot.camera,
             next_seq: snapshot.next_seq,
-            features: snapshot.features.into_iter().map(exact).collect(),
+            features: snapshot.features.into_iter().map(shrunk).collect(),
             conditioning,
         })
     }
@@ -297,7 +297,7 @@ fn check_features(index: usize, features: &[f32], spec: &ModelSpec) -> Result<()
 }
 
 /// Features that take no more memory than their numbers: a session keeps them for long.
-fn exact(mut features: Vec<f32>) -> Features {
+fn shrunk(mut features: Vec<f32>) -> Features {
     features.shrink_to_fit();
     features.into()
 }

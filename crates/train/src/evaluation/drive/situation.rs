@@ -28,7 +28,7 @@ pub(super) const LIMITS: [ActionLimit; 2] = [
 /// The distance that planning drivers keep, in metres.
 pub(super) const MARGIN_M: f32 = 0.15;
 
-/// The camera shows a robot if at least 6 of its pixels are in the picture.
+/// The camera shows a robot if at least this number of its pixels is in the picture.
 const SEEN_PIXELS: usize = 6;
 
 /// What a driver knows at a frame.
