@@ -147,6 +147,7 @@ fn every_pass_of_a_shipped_model_can_be_divided() {
     for measured in [
         "/surroundings/movers/now",
         "/surroundings/depth/frames",
+        "/visibility/methods/0/mse/3",
         "/uncertainty/novelty",
     ] {
         assert!(
@@ -163,6 +164,7 @@ fn every_pass_of_a_shipped_model_can_be_divided() {
         "plans-0",
         "scores-0",
         "surroundings-0",
+        "visibility-0",
     ] {
         assert!(stages.contains(&format!("test-{stage}")), "{stages:?}");
     }

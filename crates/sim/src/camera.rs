@@ -80,6 +80,28 @@ impl Camera {
         })
     }
 
+    /// Width and height of the image in pixels.
+    #[must_use]
+    #[doc(hidden)]
+    pub fn size_px(&self) -> [usize; 2] {
+        [self.width, self.height]
+    }
+
+    /// The point [x, y, z] of the room that is seen at a place [column, row] of the image, at that depth along the camera's axis, in
+    /// metres.
+    #[must_use]
+    #[doc(hidden)]
+    pub fn point_m(&self, [column, row]: [f32; 2], depth_m: f32) -> [f32; 3] {
+        (self.position + self.direction(column, row) * depth_m).to_array()
+    }
+
+    /// The depth of a point of the room along the camera's axis, in metres; negative behind the camera.
+    #[must_use]
+    #[doc(hidden)]
+    pub fn depth_m(&self, point_m: [f32; 3]) -> f32 {
+        (Vector::from_array(point_m) - self.position).dot(self.forward)
+    }
+
     /// Renders an image with noise, and its segmentation mask. Errors: `Frame` if the size is out of range.
     pub(super) fn capture(
         &self,

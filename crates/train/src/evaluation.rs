@@ -34,6 +34,7 @@ mod statistics;
 pub mod surroundings;
 pub mod uncertainty;
 mod verdict;
+pub mod visibility;
 mod windows;
 
 use std::time::Instant;

@@ -8,6 +8,7 @@ use super::bootstrap::{CONFIDENCE, FEWEST_GROUPS};
 use super::method::Method;
 use super::metrics::PSNR_CAP_DB;
 use super::report::{EvaluationReport, SetScores};
+use super::visibility::PixelClass;
 
 /// Squared errors are shown in this unit.
 const MSE_UNIT: f64 = 1e-4;
@@ -24,6 +25,7 @@ impl EvaluationReport {
         environment.add_filter("grouped", grouped);
         environment.add_filter("set_title", set_title);
         environment.add_filter("method", |method: ViaDeserialize<Method>| method.label());
+        environment.add_filter("pixel_class", |class: ViaDeserialize<PixelClass>| class.label());
         environment.add_filter("variant", |variant: ViaDeserialize<Variant>| variant.label());
         let verdicts = self.sets.iter().map(|set| set.outcome.scores().map(SetScores::verdict));
         let report = Value::from_serialize(self);

@@ -13,6 +13,7 @@ use super::report::SetScores;
 use super::score::score;
 use super::surroundings::{self, SurroundingsMeasurements};
 use super::uncertainty;
+use super::visibility::{self, ClassSums};
 use foreframe_data::dataset::Window;
 
 /// What was measured of the windows of a set; in a part, of its share of them.
@@ -21,6 +22,7 @@ pub(super) struct Measurements {
     /// `None` for a model that takes no actions.
     actions: Option<ActionMeasurements>,
     surroundings: Option<SurroundingsMeasurements>,
+    visibility: Vec<Option<ClassSums>>,
     /// `None` for a model without calibration.
     forecasts: Option<Vec<Forecast>>,
 }
@@ -53,6 +55,7 @@ impl Measurements {
             scores: score(evaluation, windows, baselines)?,
             actions: loaded.spec().action_inputs().map(|_| actions()).transpose()?,
             surroundings: surroundings::measure(evaluation, windows)?,
+            visibility: visibility::measure(evaluation, windows, baselines)?,
             forecasts: calibration
                 .map(|calibration| forecasts(evaluation, windows, calibration))
                 .transpose()?,
@@ -79,6 +82,7 @@ impl Measurements {
             scores.ranking = ranking::rates(evaluation, windows, &group_of, &found.ranking, &bootstrap);
         }
         scores.surroundings = self.surroundings.map(SurroundingsMeasurements::scores);
+        scores.visibility = visibility::scores(baselines.methods(), self.visibility);
         let mut novelty = Vec::new();
         if let (Some(calibration), Some(found)) = (&inference.loaded.manifest.calibration, &self.forecasts) {
             let (measured, found) = uncertainty::scores(calibration, found);

@@ -27,6 +27,8 @@ pub enum EvaluationStage {
     Surroundings,
     /// How far away things are.
     Depth,
+    /// Where the error sits.
+    Visibility,
     /// Expected errors and novelty.
     Calibration,
 }
@@ -42,6 +44,7 @@ impl EvaluationStage {
             Self::Ranking => "ranking",
             Self::Surroundings => "surroundings",
             Self::Depth => "depth",
+            Self::Visibility => "visibility",
             Self::Calibration => "calibration",
         }
     }

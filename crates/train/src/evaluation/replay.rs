@@ -1,4 +1,4 @@
-//! The simulated world of a data set's trial, as it was at one of its frames.
+//! The simulated world of a data set's trial, as it was at its frames.
 
 use super::EvaluationError;
 use super::inference::Inference;
@@ -7,6 +7,7 @@ use foreframe_core::frame::preprocess::scale;
 use foreframe_core::frame::quality;
 use foreframe_core::types::Action;
 use foreframe_data::dataset::{Dataset, Window};
+use foreframe_sim::camera::Camera;
 use foreframe_sim::{World, WorldConfig};
 
 /// A replayed frame that differs by more than this mean squared error is not the recorded one.
@@ -19,12 +20,54 @@ pub(super) fn replayed(
     world: &WorldConfig,
     window: Window,
 ) -> Result<Option<World>, EvaluationError> {
-    let dataset = inference.dataset;
-    let episode = &dataset.episodes()[window.episode];
+    let last = window.first_frame + inference.spec().context - 1;
+    replayed_to(inference.dataset, world, window.episode, last)
+}
+
+/// What one frame of a trial shows.
+pub(super) struct ReplayedView {
+    pub(super) camera: Camera,
+    /// How far away what each pixel shows is, along the camera's axis, in metres.
+    pub(super) depths_m: Vec<f32>,
+    /// The id of the robot that each pixel shows; 0 for the rest.
+    pub(super) robots: Vec<u8>,
+}
+
+/// What all frames of a window show, `frames` in number. `None` and errors: as [`replayed`].
+pub(super) fn replayed_views(
+    dataset: &Dataset,
+    world: &WorldConfig,
+    window: Window,
+    frames: usize,
+) -> Result<Option<Vec<ReplayedView>>, EvaluationError> {
+    let Some(mut replay) = replayed_to(dataset, world, window.episode, window.first_frame)? else {
+        return Ok(None);
+    };
+    let mut views = Vec::with_capacity(frames);
+    for frame in window.first_frame..window.first_frame + frames {
+        if frame > window.first_frame {
+            replay.step(&action(dataset, frame - 1)?)?;
+        }
+        views.push(ReplayedView {
+            camera: replay.camera(),
+            depths_m: replay.depths(),
+            robots: replay.observe().mask,
+        });
+    }
+    Ok(Some(views))
+}
+
+/// Replays a trial up to one of its frames. `None` and errors: as [`replayed`].
+fn replayed_to(
+    dataset: &Dataset,
+    world: &WorldConfig,
+    episode: usize,
+    last: usize,
+) -> Result<Option<World>, EvaluationError> {
+    let episode = &dataset.episodes()[episode];
     let Some(trial) = &episode.trial else {
         return Ok(None);
     };
-    let last = window.first_frame + inference.spec().context - 1;
     let recorded = true_frame(dataset, last)?;
     let mut replay = World::from_parameters(trial.clone(), world)?;
     for frame in episode.first_frame..last {

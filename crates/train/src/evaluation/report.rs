@@ -16,6 +16,7 @@ use super::ranking::PlanRanking;
 use super::skill::{Skill, skill};
 use super::surroundings::SurroundingsScores;
 use super::uncertainty::{NoveltyScores, UncertaintyScores};
+use super::visibility::VisibilityScores;
 use foreframe_core::registry::{DatasetStamp, Model, ProgramStamp};
 use foreframe_core::types::{ModelName, Seed};
 use foreframe_data::dataset::Window;
@@ -289,6 +290,10 @@ pub struct SetScores {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[doc(hidden)]
     pub surroundings: Option<SurroundingsScores>,
+    /// Errors by what a pixel shows. Absent where the simulator cannot tell.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[doc(hidden)]
+    pub visibility: Option<VisibilityScores>,
     /// How well the expected errors fit. Absent for a model without calibration.
     #[serde(default)]
     pub uncertainty: Option<UncertaintyScores>,
@@ -317,6 +322,7 @@ impl SetScores {
             plans: None,
             ranking: None,
             surroundings: None,
+            visibility: None,
             uncertainty: None,
             samples: SampleWindow::choose(windows),
         }
