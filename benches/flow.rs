@@ -1,7 +1,7 @@
 //! Time of the shipped flow networks: a window, a step of a stream, and rollouts of many plans. The cases take turns, and the
 //! least of each is printed, since other programs run too.
 //!
-//! `cargo bench --bench flow [-- ROUNDS]`; with `taskset -c 0` and `RAYON_NUM_THREADS=1` before it, on one core.
+//! `cargo bench --bench flow [-- ROUNDS MODEL...]`; with `taskset -c 0` and `RAYON_NUM_THREADS=1` before it, on one core.
 #![allow(clippy::unwrap_used, missing_docs)]
 
 use std::path::Path;
@@ -96,9 +96,15 @@ fn main() {
     } else {
         (rounds.unwrap_or(ROUNDS), REPEATS)
     };
-    let names = ["moving-flow", "rooms", "static-flow"];
-    let mut benches = names.map(Bench::new);
-    let mut least = [[Duration::MAX; 4]; 3];
+    let mut names = vec!["moving-flow", "rooms", "static-flow"];
+    if names
+        .iter()
+        .any(|name| arguments.iter().any(|argument| argument == name))
+    {
+        names.retain(|name| arguments.iter().any(|argument| argument == name));
+    }
+    let mut benches: Vec<Bench> = names.iter().map(|name| Bench::new(name)).collect();
+    let mut least = vec![[Duration::MAX; 4]; names.len()];
     for _ in 0..rounds {
         for (bench, least) in benches.iter_mut().zip(&mut least) {
             let mut note = |case: usize, taken: Duration| least[case] = least[case].min(taken);

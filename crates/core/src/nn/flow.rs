@@ -34,6 +34,7 @@ mod reprojection;
 mod rollout_rows;
 mod room_geometry;
 mod scene;
+mod steps_ahead;
 
 pub(super) use layers::{multiply_adds_per_frame, tensor_shapes};
 pub(super) use network::FlowNetwork;

@@ -9,3 +9,5 @@ pub(super) mod modulation;
 pub(super) mod packed;
 pub(super) mod pixel_shuffle;
 pub(super) mod sampling;
+mod scratch;
+mod winograd;

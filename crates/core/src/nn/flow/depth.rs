@@ -1,15 +1,17 @@
 //! The form of the flow network that estimates depth: what the last frame shows is placed in space, and seen from where the
-//! camera will be. It remembers no place, so it serves in rooms that it never saw. All steps are computed at once.
+//! camera will be. It remembers no place, so it serves in rooms that it never saw.
 
 use candle_core::{DType, Device, Tensor};
+use rayon::prelude::*;
 
 use super::blocks::sampled_blocks;
 use super::depth_head::{DepthHead, SeenPlaces};
 use super::depth_views::DepthViews;
-use super::network::{FlowNetwork, FlowPrediction, Surroundings};
+use super::network::{FlowNetwork, Surroundings};
 use super::occupancy::{Occupancy, OccupancyView};
 use super::reprojection::{Reprojection, reproject};
 use super::rollout_rows::RolloutRows;
+use super::steps_ahead::{PredictedAhead, StepsAhead};
 use crate::frame::warp::CameraModel;
 use crate::nn::conditioning::ConditioningTensors;
 use crate::nn::error::NnError;
@@ -26,7 +28,7 @@ pub(super) struct SeenDepths {
     /// Of each pixel of the last frames `[contexts, P]`, in metres.
     depths: Tensor,
     /// Where movers are in the last frames, as logits `[contexts, P]`.
-    movers: Option<Tensor>,
+    pub(super) movers: Option<Tensor>,
 }
 
 /// Where the frames after contexts are seen from, and the decoder's state of each.
@@ -61,7 +63,7 @@ impl FlowNetwork {
 
     /// Of one rollout.
     fn occupancy_of(&self, row: &RolloutRows, head: &DepthHead) -> Result<Occupancy, NnError> {
-        let (size, horizon) = (self.spec.image_size(), self.spec.horizon);
+        let size = self.spec.image_size();
         let depths = self.see_depth(row, head)?;
         let camera = row.camera(0).unwrap_or(CameraModel::USUAL);
         let view = OccupancyView {
@@ -80,10 +82,13 @@ impl FlowNetwork {
                 ..known
             });
         };
-        let motion = self.motion.forward(row)?;
-        let ahead = self.see_ahead(row, horizon, &depths, &motion)?;
-        let coming = layers.coming(&ahead.state)?;
-        let motions = motion.flatten_all()?.to_vec1::<f32>()?;
+        let ahead = self.known_ahead(row)?;
+        let each = (0..self.spec.horizon).into_par_iter().map(|step| {
+            let seen = self.see_ahead(&StepsAhead::new(row, step..step + 1, &ahead), &depths)?;
+            layers.coming(&seen.state)
+        });
+        let coming = Tensor::cat(&each.collect::<Result<Vec<_>, NnError>>()?, 0)?;
+        let motions = ahead.motion.flatten_all()?.to_vec1::<f32>()?;
         let logits = Tensor::cat(&[seen, &coming], 0)?;
         Ok(with_values(&logits, |logits| {
             let motions = std::iter::once([0.0; 3]).chain(motions.as_chunks::<3>().0.iter().copied());
@@ -116,33 +121,21 @@ impl FlowNetwork {
         })
     }
 
-    /// What the first `steps` frames of the rollouts are computed from.
-    fn see_ahead(
-        &self,
-        rows: &RolloutRows,
-        steps: usize,
-        depths: &SeenDepths,
-        motion: &Tensor,
-    ) -> Result<SeenAhead, NnError> {
-        let (size, horizon) = (self.spec.image_size(), self.spec.horizon);
-        // Frames that are not asked for are not computed.
-        let of_steps = |&context: &u32| std::iter::repeat_n(context, steps);
-        let context_of: Vec<u32> = rows.context_of().iter().flat_map(of_steps).collect();
-        let asked = |per_step: &Tensor| -> Result<Tensor, NnError> {
-            let per_step = per_step.reshape((rows.count(), horizon, ()))?;
-            Ok(per_step.narrow(1, 0, steps)?.flatten(0, 1)?)
-        };
+    /// What the frames of these steps are computed from.
+    fn see_ahead(&self, ahead: &StepsAhead, depths: &SeenDepths) -> Result<SeenAhead, NnError> {
+        let size = self.spec.image_size();
+        let context_of = ahead.context_of();
         let reprojection = Reprojection {
             size,
             viewers: depths.views.viewers.clone(),
             context_of: context_of.clone(),
         };
-        let places = reproject(reprojection, &depths.depths, &asked(motion)?)?;
+        let places = reproject(reprojection, &depths.depths, &ahead.motion()?)?;
         let seen = with_values(&places, |places| SeenPlaces::of(places, size))?;
         let warped = sample_features(&depths.coarse, seen.coarse.clone(), &context_of)?;
         let beside = seen.beside_features(&depths.views, &context_of, size)?;
         let state = per_place(&self.mix, &Tensor::cat(&[&warped, &beside], 3)?)?;
-        let state = self.refined(state, &asked(&self.modulate(rows, motion)?)?)?;
+        let state = self.refined(state, &ahead.modulation()?)?;
         Ok(SeenAhead {
             context_of,
             places,
@@ -151,29 +144,21 @@ impl FlowNetwork {
         })
     }
 
-    /// All steps of the rollouts at once; gives the frames of the first `steps`.
+    /// The frames of these steps.
     pub(super) fn predict_with_depth(
         &self,
-        rows: &RolloutRows,
-        steps: usize,
+        ahead: &StepsAhead,
         depths: &SeenDepths,
-    ) -> Result<FlowPrediction, NnError> {
+    ) -> Result<PredictedAhead, NnError> {
         let (size, views) = (self.spec.image_size(), &depths.views);
-        let motion = self.motion.forward(rows)?;
+        let shape = (ahead.rows.count(), ahead.steps(), size.pixels());
         let SeenAhead {
             context_of,
             places,
             seen,
             state,
-        } = self.see_ahead(rows, steps, depths, &motion)?;
-        let movers = match (&self.movers, &depths.movers) {
-            (Some(head), Some(seen)) => {
-                let seen = seen.index_select(&Tensor::new(rows.context_of(), &Device::Cpu)?, 0)?;
-                let coming = head.coming(&state)?.reshape((rows.count(), steps, ()))?;
-                Some(Tensor::cat(&[&seen.unsqueeze(1)?, &coming], 1)?)
-            }
-            _ => None,
-        };
+        } = self.see_ahead(ahead, depths)?;
+        let movers = self.movers.as_ref().map(|movers| movers.coming(&state)).transpose()?;
         let moved = sampled_blocks(&views.frames, &context_of, &seen.room, size)?;
         let head = self.head(&state, &moved, &seen.beside_pixels(views, &context_of, size)?)?;
 
@@ -194,11 +179,10 @@ impl FlowNetwork {
             Ok(Tensor::from_vec(levels, (context_of.len(), 1), &Device::Cpu)?)
         };
         let frames = frames.broadcast_mul(&level(1)?)?.broadcast_add(&level(0)?)?;
-        Ok(FlowPrediction {
-            frames: frames.reshape((rows.count(), steps, size.pixels()))?,
+        Ok(PredictedAhead {
+            frames: frames.reshape(shape)?,
             scene: None,
-            motion,
-            movers,
+            movers: movers.map(|movers| movers.reshape(shape)).transpose()?,
         })
     }
 }

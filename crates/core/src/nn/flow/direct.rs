@@ -1,11 +1,12 @@
-//! The direct form of the flow network: every step starts from the last true frame, so all steps are computed at once.
+//! The direct form of the flow network: every step starts from the last true frame, so no step needs another one.
 
 use candle_core::{Device, Tensor};
 
 use super::blocks::{coarse_places, content_frames, sampled_blocks};
-use super::network::{FlowNetwork, FlowPrediction};
+use super::network::FlowNetwork;
 use super::rollout_rows::RolloutRows;
 use super::scene::Scene;
+use super::steps_ahead::{PredictedAhead, StepsAhead};
 use crate::nn::error::NnError;
 use crate::nn::geometry::camera::{CameraPose, Viewer, turning_places};
 use crate::nn::ops::compose::{Composition, RoomPlaces, SCENE_FEATURES};
@@ -34,40 +35,29 @@ impl FlowNetwork {
         })
     }
 
-    /// All steps of the rollouts at once; gives the frames of the first `steps`.
+    /// The frames of these steps.
     pub(super) fn predict_directly(
         &self,
-        rows: &RolloutRows,
-        steps: usize,
+        ahead: &StepsAhead,
         scene: &Scene,
         seen: &SeenContexts,
-    ) -> Result<FlowPrediction, NnError> {
+    ) -> Result<PredictedAhead, NnError> {
         let size = self.spec.image_size();
-        let shape = (rows.count(), self.spec.horizon, size.pixels());
-        let motion = self.motion.forward(rows)?;
-        let before = rows.poses_before();
-        let poses: Vec<CameraPose> = with_values(&motion, |motions| {
-            let motions = motions.as_chunks::<3>().0;
-            before
-                .iter()
-                .zip(motions)
-                .map(|(pose, &motion)| pose.moved(motion))
-                .collect()
-        })?;
-        let geometry = self.places(&motion.flatten(0, 1)?, &poses, &before, scene)?;
-        let scene = scene.forward(rows, &motion, &poses)?;
-        let of_steps = |&context: &u32| std::iter::repeat_n(context, self.spec.horizon);
-        let context_of: Vec<u32> = rows.context_of().iter().flat_map(of_steps).collect();
+        let shape = (ahead.rows.count(), ahead.steps(), size.pixels());
+        let motion = ahead.motion()?;
+        let [before, poses] = ahead.poses()?;
+        let geometry = self.places(&motion, &poses, &before, scene)?;
+        let scene = scene.forward(ahead.rows, &ahead.row_of(), &motion, &poses)?;
+        let context_of = ahead.context_of();
         let warped = sample_features(&seen.coarse, geometry.coarse, &context_of)?;
         let blocks_at = |places: &[f32]| sampled_blocks(&seen.last_frames, &context_of, places, size);
         let moved = match &geometry.room {
             Some(places) => blocks_at(places)?,
             None => with_values(&geometry.turned, blocks_at)??,
         };
-        let modulation = self.modulate(rows, &motion)?;
         let features = scene.narrow(3, 0, SCENE_FEATURES)?;
         let mixed = Tensor::cat(&[&warped, &pixel_unshuffle(&features)?], 3)?;
-        let state = self.refined(per_place(&self.mix, &mixed)?, &modulation)?;
+        let state = self.refined(per_place(&self.mix, &mixed)?, &ahead.modulation()?)?;
         let head = self.head(&state, &moved, &scene)?;
 
         let composition = Composition {
@@ -77,10 +67,9 @@ impl FlowNetwork {
             room: geometry.room.map_or(RoomPlaces::Turned, RoomPlaces::Known),
         };
         let frames = composition.compose(&head, &scene, &geometry.turned)?;
-        Ok(FlowPrediction {
-            frames: frames.reshape(shape)?.narrow(1, 0, steps)?,
+        Ok(PredictedAhead {
+            frames: frames.reshape(shape)?,
             scene: Some(content_frames(&scene)?.reshape(shape)?),
-            motion,
             movers: None,
         })
     }

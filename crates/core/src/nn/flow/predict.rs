@@ -1,20 +1,19 @@
 //! Predicts the rollouts of a batch with the flow network, in any of its forms, on all threads of the pool that it is called in.
 //!
-//! What depends only on the context is computed once for all rollouts that follow it. The rollouts are then computed few at a
-//! time, so that what lies between two layers stays in the processor's cache, and many take no more memory than few.
+//! What depends only on the context is computed once for all rollouts that follow it. Without gradients, each step is then computed
+//! on its own, so that what lies between two layers stays in the processor's cache, many rollouts take no more memory than few, and
+//! a single one is computed by several threads too.
 
 use std::ops::Range;
 
-use candle_core::Tensor;
+use candle_core::{Device, Tensor};
 use rayon::prelude::*;
 
 use super::network::{FlowNetwork, FlowPrediction, Surroundings};
 use super::rollout_rows::RolloutRows;
+use super::steps_ahead::{PredictedAhead, StepsAhead};
 use crate::nn::conditioning::ConditioningTensors;
 use crate::nn::error::NnError;
-
-/// Rollouts of one context that are computed together without gradients.
-const ROLLOUTS_TOGETHER: usize = 1;
 
 impl FlowNetwork {
     /// N rollouts of B windows of frames `[B, context, P]`, with the frames of the first `steps` only: rollout n follows
@@ -37,31 +36,79 @@ impl FlowNetwork {
         match &self.surroundings {
             Surroundings::Seen(depth) => {
                 let seen = self.see_depth(rows, depth)?;
-                self.in_small_parts(rows, |rows| self.predict_with_depth(rows, steps, &seen))
+                let movers = seen.movers.as_ref();
+                self.in_steps(rows, steps, movers, |ahead| self.predict_with_depth(ahead, &seen))
             }
             Surroundings::Remembered(scene) if self.sizes.layers.recurrent => {
                 self.predict_recurrently(rows, steps, scene)
             }
             Surroundings::Remembered(scene) => {
                 let seen = self.see(rows, scene)?;
-                self.in_small_parts(rows, |rows| self.predict_directly(rows, steps, scene, &seen))
+                self.in_steps(rows, steps, None, |ahead| self.predict_directly(ahead, scene, &seen))
             }
         }
     }
 
-    /// Without gradients, few of the rollouts of one context at a time; else all together.
-    fn in_small_parts(
+    /// The first `steps` of the rollouts: without gradients, each step on its own; else all together. `movers`: where they are in the
+    /// last frames, as logits `[contexts, P]`.
+    fn in_steps(
         &self,
         rows: &RolloutRows,
-        predict: impl Fn(&RolloutRows) -> Result<FlowPrediction, NnError> + Sync,
+        steps: usize,
+        movers: Option<&Tensor>,
+        predict: impl Fn(&StepsAhead) -> Result<PredictedAhead, NnError> + Sync,
     ) -> Result<FlowPrediction, NnError> {
-        if self.is_trained() {
-            return predict(rows);
+        let with_motion = |predicted: PredictedAhead, motion: Tensor| -> Result<FlowPrediction, NnError> {
+            let PredictedAhead { frames, scene, movers } = predicted;
+            Ok(FlowPrediction {
+                frames,
+                scene,
+                motion,
+                movers,
+            })
+        };
+        let mut predicted = if self.is_trained() {
+            let known = self.known_ahead(rows)?;
+            // The scene's own loss is of all steps.
+            let computed = if self.sizes.layers.depth {
+                steps
+            } else {
+                self.spec.horizon
+            };
+            let all = predict(&StepsAhead::new(rows, 0..computed, &known))?;
+            let asked = PredictedAhead {
+                frames: all.frames.narrow(1, 0, steps)?,
+                ..all
+            };
+            with_motion(asked, known.motion)?
+        } else {
+            in_parts(rows, (0..rows.count()).map(|row| row..row + 1).collect(), |row| {
+                let known = self.known_ahead(row)?;
+                let each = (0..steps).into_par_iter();
+                let parts = each.map(|step| predict(&StepsAhead::new(row, step..step + 1, &known)));
+                let parts = parts.collect::<Result<Vec<_>, NnError>>()?;
+                with_motion(joined_steps(&parts)?, known.motion)
+            })?
+        };
+        if let (Some(seen), Some(coming)) = (movers, &predicted.movers) {
+            let seen = seen.index_select(&Tensor::new(rows.context_of(), &Device::Cpu)?, 0)?;
+            predicted.movers = Some(Tensor::cat(&[&seen.unsqueeze(1)?, coming], 1)?);
         }
-        let firsts = (0..rows.count()).step_by(ROLLOUTS_TOGETHER);
-        let parts = firsts.map(|first| first..rows.count().min(first + ROLLOUTS_TOGETHER));
-        in_parts(rows, parts.collect(), predict)
+        Ok(predicted)
     }
+}
+
+/// Steps of the same rollouts, one after another.
+fn joined_steps(parts: &[PredictedAhead]) -> Result<PredictedAhead, NnError> {
+    let joined = |of: fn(&PredictedAhead) -> Option<&Tensor>| {
+        let given: Vec<&Tensor> = parts.iter().filter_map(of).collect();
+        (!given.is_empty()).then(|| Tensor::cat(&given, 1)).transpose()
+    };
+    Ok(PredictedAhead {
+        frames: Tensor::cat(&parts.iter().map(|part| &part.frames).collect::<Vec<_>>(), 1)?,
+        scene: joined(|part| part.scene.as_ref())?,
+        movers: joined(|part| part.movers.as_ref())?,
+    })
 }
 
 /// The predictions of parts of the rollouts, joined.

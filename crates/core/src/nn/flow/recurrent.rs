@@ -37,7 +37,12 @@ impl FlowNetwork {
         let mut state = sample_features(&coarse, own_coarse, &context_of)?;
 
         let poses = vec![CameraPose::default(); count];
-        let scene = scene.forward(rows, &motion, &poses)?;
+        let scene = scene.forward(
+            rows,
+            &(0..count).collect::<Vec<_>>(),
+            &motion.narrow(1, 0, 1)?.squeeze(1)?,
+            &poses,
+        )?;
         let features = pixel_unshuffle(&scene.narrow(3, 0, SCENE_FEATURES)?)?;
         let modulation = self.modulate(rows, &motion)?.reshape((count, horizon, ()))?;
         let own = own_places(size).repeat(count);

@@ -129,14 +129,8 @@ impl<'a> RolloutRows<'a> {
     }
 
     /// Where the state says that the camera stands at the last frame of a rollout's context.
-    fn pose(&self, row: usize) -> CameraPose {
+    pub(super) fn pose(&self, row: usize) -> CameraPose {
         StateChannels::of(self.spec).pose_in(self.state(row))
-    }
-
-    /// Where the camera stands at the last frame of the context of each step's rollout.
-    pub(super) fn poses_before(&self) -> Vec<CameraPose> {
-        let of_steps = |row| std::iter::repeat_n(self.pose(row), self.spec.horizon);
-        (0..self.count()).flat_map(of_steps).collect()
     }
 
     /// State and all actions of each rollout, scaled, `[N, S + horizon · A]`.

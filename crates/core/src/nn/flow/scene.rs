@@ -114,16 +114,20 @@ impl Scene {
         Ok(())
     }
 
-    /// The scene at each item, `[M, H/2, W/2, SCENE_CHANNELS]`.
-    pub(super) fn forward(&self, rows: &RolloutRows, motion: &Tensor, poses: &[CameraPose]) -> Result<Tensor, NnError> {
+    /// The scene at items with these motions `[M, 3]`, `[M, H/2, W/2, SCENE_CHANNELS]`. `row_of`: the row of each item's rollout.
+    pub(super) fn forward(
+        &self,
+        rows: &RolloutRows,
+        row_of: &[usize],
+        motion: &Tensor,
+        poses: &[CameraPose],
+    ) -> Result<Tensor, NnError> {
         let scaled: Vec<Vec<f32>> = (0..rows.count())
             .map(|row| rows.spec.scaled_state(rows.state(row)))
             .collect();
         let views = SceneViews {
-            states: (0..poses.len())
-                .map(|item| scaled[item / rows.spec.horizon].as_slice())
-                .collect(),
-            motion: motion.flatten(0, 1)?,
+            states: row_of.iter().map(|&row| scaled[row].as_slice()).collect(),
+            motion: motion.clone(),
             poses,
         };
         self.seen(rows.spec, &views)

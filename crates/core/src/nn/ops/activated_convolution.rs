@@ -7,9 +7,11 @@
 use candle_core::{Result, Tensor, bail};
 use candle_nn::Module as _;
 
-use super::convolution::{Convolution3, ImageGeometry};
+use super::convolution::{Convolution3, ImageGeometry, PackedKernel};
 use super::modulation::{activate, modulated_silu, silu};
-use super::packed::{PackedWeights, PlaceInputs, StartSums, TapRun};
+use super::packed::{PlaceInputs, StartSums, TapRun};
+use super::scratch::with_buffers;
+use super::winograd::TiledConvolution;
 use crate::nn::tensors::with_values;
 use crate::vectorized::vectorized;
 
@@ -45,21 +47,21 @@ pub(in crate::nn) fn activated_convolution(
 
 fn predict(
     layer: &Convolution3,
-    packed: &PackedWeights,
+    packed: &PackedKernel,
     x: &Tensor,
     activation: Activation,
     added: Option<&Tensor>,
 ) -> Result<Tensor> {
     let dims = x.dims4()?;
     let image = ImageGeometry::of(dims, layer.shape);
-    let outputs = packed.outputs();
+    let outputs = packed.places.outputs();
     let shape = (dims.0, image.out_height(), image.out_width(), outputs);
     let (mut out, start) = match added {
         Some(added) if added.dims4()? != shape => bail!("{:?} is not added to {shape:?}", added.dims()),
         Some(added) => (with_values(added, <[f32]>::to_vec)?, StartSums::Output),
         None => (vec![0.0; dims.0 * image.places() * outputs], StartSums::Bias),
     };
-    let mut convolution = BorderedConvolution::new(packed, image);
+    let convolution = BorderedConvolution::new(packed, image);
     let mut convolve = |x: &[f32], modulations: &[f32]| {
         let modulations = modulations.chunks_exact(2 * image.channels);
         let items = x
@@ -92,49 +94,66 @@ enum Written<'a> {
     Modulated(&'a [f32]),
 }
 
-/// A convolution with its image, whose border stays zero.
+/// A convolution of images with a border of zeros.
 struct BorderedConvolution<'a> {
-    packed: &'a PackedWeights,
+    packed: &'a PackedKernel,
     image: ImageGeometry,
     runs: Vec<TapRun>,
-    values: Vec<f32>,
+    /// Where the weights fit.
+    tiled: Option<TiledConvolution<'a>>,
 }
 
 impl<'a> BorderedConvolution<'a> {
-    fn new(packed: &'a PackedWeights, image: ImageGeometry) -> Self {
-        let height = image.height + 2 * image.shape.dilation;
+    fn new(packed: &'a PackedKernel, image: ImageGeometry) -> Self {
+        let patches = packed.patches.as_ref().filter(|patches| patches.fit(image));
         Self {
+            tiled: patches.map(|patches| TiledConvolution::new(patches, image)),
             packed,
             image,
             runs: image.runs().collect(),
-            values: vec![0.0; height * image.pitch() * image.channels],
         }
     }
 
     /// Computes one item.
-    fn forward(&mut self, x: &[f32], out: &mut [f32], start: StartSums, written: Written) {
-        self.write(x, written);
+    fn forward(&self, x: &[f32], out: &mut [f32], start: StartSums, written: Written) {
+        let bordered = (self.image.height + 2 * self.image.shape.dilation) * self.image.pitch() * self.image.channels;
+        let [patches, products] = self.tiled.as_ref().map_or([0; 2], TiledConvolution::buffers);
+        with_buffers([bordered, patches, products], |[bordered, patches, products]| {
+            self.write(bordered, x, written);
+            match &self.tiled {
+                Some(tiled) => tiled.forward(bordered, [patches, products], out, start),
+                None => self.convolve(bordered, out, start),
+            }
+        });
+    }
+
+    fn convolve(&self, bordered: &[f32], out: &mut [f32], start: StartSums) {
         let ImageGeometry { channels, shape, .. } = self.image;
-        let row_length = self.image.out_width() * self.packed.outputs();
+        let row_length = self.image.out_width() * self.packed.places.outputs();
         for (row, out) in out.chunks_exact_mut(row_length).enumerate() {
             let inputs = PlaceInputs {
-                values: &self.values[row * shape.stride * self.image.pitch() * channels..],
+                values: &bordered[row * shape.stride * self.image.pitch() * channels..],
                 step: shape.stride * channels,
                 runs: &self.runs,
             };
-            self.packed.multiply(inputs, out, start);
+            self.packed.places.multiply(inputs, out, start);
         }
     }
 
-    fn write(&mut self, x: &[f32], written: Written) {
-        let (image, bordered) = (self.image, &mut self.values);
+    /// Writes an item with its border.
+    fn write(&self, bordered: &mut [f32], x: &[f32], written: Written) {
+        let image = self.image;
         let (length, pitch) = (image.width * image.channels, image.pitch() * image.channels);
         vectorized(
             #[inline(always)]
             || {
-                let rows = bordered[image.inside()..].chunks_mut(pitch);
-                for (to, from) in rows.zip(x.chunks_exact(length)) {
-                    let to = &mut to[..length];
+                let (above, rest) = bordered.split_at_mut(image.inside());
+                above.fill(0.0);
+                let (rows, below) = rest.split_at_mut(image.height * pitch);
+                below.fill(0.0);
+                for (to, from) in rows.chunks_exact_mut(pitch).zip(x.chunks_exact(length)) {
+                    let (to, between) = to.split_at_mut(length);
+                    between.fill(0.0);
                     match written {
                         Written::Plain => to.copy_from_slice(from),
                         Written::Silu => {

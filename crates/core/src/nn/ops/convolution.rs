@@ -9,8 +9,9 @@ use candle_core::{CpuStorage, Layout, Result, Shape, Tensor, bail};
 use candle_nn::Module;
 
 use super::packed::{PackedWeights, TapRun};
+use super::winograd::PatchWeights;
 use crate::nn::fused::{FusedOperation, Operand, apply};
-use crate::nn::tensors::{product, sum_columns};
+use crate::nn::tensors::{product, sum_columns, with_values};
 
 /// Side of the kernel.
 const SIDE: usize = 3;
@@ -46,13 +47,29 @@ pub(in crate::nn) struct Convolution3 {
     pub(in crate::nn) bias: Tensor,
     pub(in crate::nn) shape: ConvShape,
     /// For prediction, which then does not use the tensors.
-    pub(in crate::nn) packed: Option<Arc<PackedWeights>>,
+    pub(in crate::nn) packed: Option<Arc<PackedKernel>>,
+}
+
+/// The weights of a convolution for prediction.
+#[derive(Debug)]
+pub(in crate::nn) struct PackedKernel {
+    /// For each place on its own.
+    pub(super) places: PackedWeights,
+    /// For tiles of 2×2 places, of a convolution without a stride.
+    pub(super) patches: Option<PatchWeights>,
 }
 
 impl Convolution3 {
     /// Packs the weights as they are now.
     pub(in crate::nn) fn pack(&mut self) -> Result<()> {
-        self.packed = Some(PackedWeights::of(&self.weight, &self.bias)?);
+        let kernel = |weights: &[f32], bias: &[f32]| PackedKernel {
+            places: PackedWeights::new(weights, bias),
+            patches: (self.shape.stride == 1).then(|| PatchWeights::new(weights, bias)),
+        };
+        let packed = with_values(&self.weight, |weights| {
+            with_values(&self.bias, |bias| kernel(weights, bias))
+        })??;
+        self.packed = Some(Arc::new(packed));
         Ok(())
     }
 }

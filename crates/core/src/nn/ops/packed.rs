@@ -66,7 +66,7 @@ pub(in crate::nn) enum StartSums {
 impl PackedWeights {
     /// Packs weights `[inputs, outputs]` and a bias `[outputs]`.
     pub(in crate::nn) fn new(weights: &[f32], bias: &[f32]) -> Self {
-        let (lanes, outputs) = (Arch::new().dispatch(Lanes), bias.len());
+        let (lanes, outputs) = (lanes(), bias.len());
         let vectors = outputs.div_ceil(lanes);
         let panels = vectors.div_ceil(MAX_VECTORS);
         let panel = |index: usize| {
@@ -128,7 +128,11 @@ impl PackedWeights {
     }
 }
 
-/// How many f32 a vector holds.
+/// How many f32 a vector of this machine holds.
+pub(super) fn lanes() -> usize {
+    Arch::new().dispatch(Lanes)
+}
+
 struct Lanes;
 
 impl WithSimd for Lanes {
@@ -203,7 +207,7 @@ impl Product<'_> {
             for (vector, sum) in sums.iter_mut().enumerate() {
                 *sum = bias[vector];
                 if self.start == StartSums::Output {
-                    *sum = simd.add_f32s(*sum, simd.partial_load_f32s(&self.out[part(at, vector)]));
+                    *sum = simd.add_f32s(*sum, load(simd, &self.out[part(at, vector)]));
                 }
             }
         }
@@ -216,7 +220,7 @@ impl Product<'_> {
         }
         for (at, sums) in sums.iter().enumerate() {
             for (vector, sum) in sums.iter().enumerate() {
-                simd.partial_store_f32s(&mut self.out[part(at, vector)], *sum);
+                store(simd, &mut self.out[part(at, vector)], *sum);
             }
         }
     }
@@ -241,6 +245,24 @@ fn with_products<S: Simd, const PLACES: usize, const VECTORS: usize>(
         }
     }
     sums
+}
+
+/// A vector of as many values as there are, at most the lanes.
+#[inline(always)]
+fn load<S: Simd>(simd: S, values: &[f32]) -> S::f32s {
+    match S::as_simd_f32s(values).0 {
+        [whole] => *whole,
+        _ => simd.partial_load_f32s(values),
+    }
+}
+
+/// Writes as many values as there is place for, at most the lanes.
+#[inline(always)]
+fn store<S: Simd>(simd: S, to: &mut [f32], values: S::f32s) {
+    match S::as_mut_simd_f32s(to) {
+        ([whole], _) => *whole = values,
+        (_, part) => simd.partial_store_f32s(part, values),
+    }
 }
 
 #[cfg(test)]
