@@ -4,7 +4,8 @@ use std::collections::BTreeMap;
 
 use candle_core::Tensor;
 
-use super::ops::convolution::{ConvShape, Convolution3};
+use super::ops::convolution::Convolution3;
+use super::ops::image_geometry::ConvShape;
 use super::ops::linear::Linear;
 
 /// A model's tensors by name, each of the shape that the specification gives.

@@ -2,8 +2,10 @@
 
 pub(super) mod activated_convolution;
 pub(super) mod activation;
+mod bordered_convolution;
 pub(super) mod compose;
 pub(super) mod convolution;
+pub(super) mod image_geometry;
 pub(super) mod linear;
 pub(super) mod modulation;
 pub(super) mod packed;

@@ -10,7 +10,7 @@ use super::motion::{MOTION_HIDDEN, WHEELS};
 use super::scene::SceneKind;
 use crate::nn::geometry::state_channels::StateChannels;
 use crate::nn::ops::compose::{HEAD_VALUES, SCENE_CHANNELS, SCENE_FEATURES};
-use crate::nn::ops::convolution::TAPS;
+use crate::nn::ops::image_geometry::TAPS;
 use crate::nn::spec::{FlowLayers, FlowSpec, ModelSpec};
 
 /// Channels of a frame on the grid of a quarter of the sides: a 4×4 block.

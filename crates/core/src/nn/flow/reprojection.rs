@@ -82,31 +82,13 @@ impl Motion {
     }
 }
 
-/// A pixel's depth after the last correction, and the pixels of the old view around where it was seen.
+/// A pixel's depth after the last correction, and the pixels of the old view around where it was seen with it.
 struct Found {
     depth: f32,
     around: Neighbourhood,
 }
 
-#[inline(always)]
-fn found(viewer: Viewer, size: ImageSize, depths: &[f32], motion: Motion, direction: [f32; 3]) -> Found {
-    let [x, y] = viewer.project(direction);
-    let around = size.around(x, y);
-    let mut found = Found {
-        depth: around.sample(depths),
-        around,
-    };
-    for _ in 0..ROUNDS {
-        let point = motion.point(direction, found.depth);
-        let [x, y] = viewer.project(point);
-        found.around = size.around(x, y);
-        let factor = found.around.sample(depths) / viewer.depth(point).max(MIN_DEPTH);
-        found.depth *= factor.clamp(CORRECTION[0], CORRECTION[1]);
-    }
-    found
-}
-
-/// Of several pixels: place before the turn, place before turn and drive, depth. The same arithmetic as [`found`].
+/// Of several pixels: place before the turn, place before turn and drive, depth.
 #[inline(always)]
 fn found_together(
     viewer: Viewer,
@@ -209,36 +191,65 @@ impl FusedOperation<2> for Reprojection {
             let (viewer, motion) = (self.viewers[context], Motion::of(&motions.values[3 * item..]));
             let own = context * pixels..(context + 1) * pixels;
             let (depths, for_depths) = (&depths.values[own.clone()], &mut for_depths[own]);
-            let gradients = gradient.values[item * pixels * PLACE_VALUES..].chunks_exact(PLACE_VALUES);
+            let gradients = &gradient.values[item * pixels * PLACE_VALUES..(item + 1) * pixels * PLACE_VALUES];
             let mut sums = [0.0f32; 3];
-            for (gradient, &ray) in gradients.zip(&rays[context]) {
-                let direction = rotated(ray, motion.sin, motion.cos);
-                let turn = [-direction[1], direction[0], 0.0];
-                sums[0] += dot(viewer.slope(direction, turn), [gradient[0], gradient[1]]);
-                let room = [gradient[2], gradient[3]];
-                if room == [0.0; 2] {
-                    continue;
-                }
-                let found = found(viewer, self.size, depths, motion, direction);
-                let point = motion.point(direction, found.depth);
-                // The depth in the old view, which is known, is this much of the depth in the new one.
-                let deepens = viewer.depth(direction).max(MIN_DEEPENING);
-                let of_depth = dot(viewer.slope(point, direction), room) / deepens;
-                let turn = turn.map(|part| part * found.depth);
-                let along = [turn, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]];
-                for (sum, along) in sums.iter_mut().zip(along) {
-                    *sum += dot(viewer.slope(point, along), room) - viewer.depth(along) * of_depth;
-                }
-                for (pixel, share) in found.around.pixels.into_iter().zip(found.around.shares()) {
-                    for_depths[pixel] += share * of_depth;
-                }
-            }
+            vectorized(
+                #[inline(always)]
+                || {
+                    let parts = gradients.chunks(SAMPLED_TOGETHER * PLACE_VALUES);
+                    for (gradients, rays) in parts.zip(rays[context].chunks(SAMPLED_TOGETHER)) {
+                        let found = found_together(viewer, self.size, depths, motion, rays);
+                        let pixels = gradients.chunks_exact(PLACE_VALUES).zip(rays).enumerate();
+                        for (at, (gradient, &ray)) in pixels {
+                            let found = Found {
+                                depth: found[4][at],
+                                around: self.size.around(found[2][at], found[3][at]),
+                            };
+                            let of_pixel = pixel_gradient(viewer, motion, ray, &found, gradient);
+                            for (sum, part) in sums.iter_mut().zip(of_pixel.motion) {
+                                *sum += part;
+                            }
+                            for (pixel, share) in found.around.pixels.into_iter().zip(found.around.shares()) {
+                                for_depths[pixel] += share * of_pixel.depth;
+                            }
+                        }
+                    }
+                },
+            );
             for_motions[3 * item..3 * item + 3].copy_from_slice(&sums);
         }
         Ok([Some(for_depths), Some(for_motions)])
     }
 }
 
+/// The gradients that a pixel's places pass on: for the motion, and for the depth in the old view where the pixel was seen.
+struct PixelGradient {
+    motion: [f32; 3],
+    depth: f32,
+}
+
+#[inline(always)]
+fn pixel_gradient(viewer: Viewer, motion: Motion, ray: [f32; 3], found: &Found, gradient: &[f32]) -> PixelGradient {
+    let direction = rotated(ray, motion.sin, motion.cos);
+    let turn = [-direction[1], direction[0], 0.0];
+    let room = [gradient[2], gradient[3]];
+    let point = motion.point(direction, found.depth);
+    // The depth in the old view, which is known, is this much of the depth in the new one.
+    let deepens = viewer.depth(direction).max(MIN_DEEPENING);
+    let of_depth = dot(viewer.slope(point, direction), room) / deepens;
+    let along = |along: [f32; 3]| dot(viewer.slope(point, along), room) - viewer.depth(along) * of_depth;
+    PixelGradient {
+        motion: [
+            dot(viewer.slope(direction, turn), [gradient[0], gradient[1]])
+                + along([turn[0] * found.depth, turn[1] * found.depth, 0.0]),
+            along([1.0, 0.0, 0.0]),
+            along([0.0, 1.0, 0.0]),
+        ],
+        depth: of_depth,
+    }
+}
+
+#[inline(always)]
 fn dot(a: [f32; 2], b: [f32; 2]) -> f32 {
     a[0] * b[0] + a[1] * b[1]
 }

@@ -1,19 +1,15 @@
 //! An activation, the convolution of what it gives, and an addition: the step that the flow network is built of. With packed
 //! weights it is one pass: the activated values are written once, into the image with its border, and the sums start from what
 //! they are added to.
-// A closure's vector instructions reach what is inlined into it, and only that.
-#![allow(clippy::inline_always)]
-
 use candle_core::{Result, Tensor, bail};
 use candle_nn::Module as _;
 
-use super::convolution::{Convolution3, ImageGeometry, PackedKernel};
-use super::modulation::{activate, modulated_silu, silu};
-use super::packed::{PlaceInputs, StartSums, TapRun};
-use super::scratch::with_buffers;
-use super::winograd::TiledConvolution;
+use super::bordered_convolution::{BorderedConvolution, PackedKernel, Written};
+use super::convolution::Convolution3;
+use super::image_geometry::ImageGeometry;
+use super::modulation::{modulated_silu, silu};
+use super::packed::StartSums;
 use crate::nn::tensors::with_values;
-use crate::vectorized::vectorized;
 
 /// What is done to a convolution's input.
 #[derive(Clone, Copy)]
@@ -54,7 +50,7 @@ fn predict(
 ) -> Result<Tensor> {
     let dims = x.dims4()?;
     let image = ImageGeometry::of(dims, layer.shape);
-    let outputs = packed.places.outputs();
+    let outputs = packed.outputs();
     let shape = (dims.0, image.out_height(), image.out_width(), outputs);
     let (mut out, start) = match added {
         Some(added) if added.dims4()? != shape => bail!("{:?} is not added to {shape:?}", added.dims()),
@@ -85,103 +81,11 @@ fn predict(
     Tensor::from_vec(out, shape, x.device())
 }
 
-/// How an item's values are written into the bordered image.
-#[derive(Clone, Copy)]
-enum Written<'a> {
-    Plain,
-    Silu,
-    /// Scales and shifts.
-    Modulated(&'a [f32]),
-}
-
-/// A convolution of images with a border of zeros.
-struct BorderedConvolution<'a> {
-    packed: &'a PackedKernel,
-    image: ImageGeometry,
-    runs: Vec<TapRun>,
-    /// Where the weights fit.
-    tiled: Option<TiledConvolution<'a>>,
-}
-
-impl<'a> BorderedConvolution<'a> {
-    fn new(packed: &'a PackedKernel, image: ImageGeometry) -> Self {
-        let patches = packed.patches.as_ref().filter(|patches| patches.fit(image));
-        Self {
-            tiled: patches.map(|patches| TiledConvolution::new(patches, image)),
-            packed,
-            image,
-            runs: image.runs().collect(),
-        }
-    }
-
-    /// Computes one item.
-    fn forward(&self, x: &[f32], out: &mut [f32], start: StartSums, written: Written) {
-        let bordered = (self.image.height + 2 * self.image.shape.dilation) * self.image.pitch() * self.image.channels;
-        let [patches, products] = self.tiled.as_ref().map_or([0; 2], TiledConvolution::buffers);
-        with_buffers([bordered, patches, products], |[bordered, patches, products]| {
-            self.write(bordered, x, written);
-            match &self.tiled {
-                Some(tiled) => tiled.forward(bordered, [patches, products], out, start),
-                None => self.convolve(bordered, out, start),
-            }
-        });
-    }
-
-    fn convolve(&self, bordered: &[f32], out: &mut [f32], start: StartSums) {
-        let ImageGeometry { channels, shape, .. } = self.image;
-        let row_length = self.image.out_width() * self.packed.places.outputs();
-        for (row, out) in out.chunks_exact_mut(row_length).enumerate() {
-            let inputs = PlaceInputs {
-                values: &bordered[row * shape.stride * self.image.pitch() * channels..],
-                step: shape.stride * channels,
-                runs: &self.runs,
-            };
-            self.packed.places.multiply(inputs, out, start);
-        }
-    }
-
-    /// Writes an item with its border.
-    fn write(&self, bordered: &mut [f32], x: &[f32], written: Written) {
-        let image = self.image;
-        let (length, pitch) = (image.width * image.channels, image.pitch() * image.channels);
-        vectorized(
-            #[inline(always)]
-            || {
-                let (above, rest) = bordered.split_at_mut(image.inside());
-                above.fill(0.0);
-                let (rows, below) = rest.split_at_mut(image.height * pitch);
-                below.fill(0.0);
-                for (to, from) in rows.chunks_exact_mut(pitch).zip(x.chunks_exact(length)) {
-                    let (to, between) = to.split_at_mut(length);
-                    between.fill(0.0);
-                    match written {
-                        Written::Plain => to.copy_from_slice(from),
-                        Written::Silu => {
-                            for (to, &from) in to.iter_mut().zip(from) {
-                                *to = activate(from);
-                            }
-                        }
-                        Written::Modulated(modulation) => {
-                            let (scale, shift) = modulation.split_at(image.channels);
-                            let places = to.chunks_exact_mut(image.channels);
-                            for (to, from) in places.zip(from.chunks_exact(image.channels)) {
-                                for (((to, from), scale), shift) in to.iter_mut().zip(from).zip(scale).zip(shift) {
-                                    *to = activate(from * (1.0 + scale) + shift);
-                                }
-                            }
-                        }
-                    }
-                }
-            },
-        );
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::nn::gradient_check::noise;
-    use crate::nn::ops::convolution::ConvShape;
+    use crate::nn::ops::image_geometry::ConvShape;
 
     #[test]
     fn packed_weights_give_what_the_tensors_give() {

@@ -8,37 +8,11 @@ use std::sync::Arc;
 use candle_core::{CpuStorage, Layout, Result, Shape, Tensor, bail};
 use candle_nn::Module;
 
-use super::packed::{PackedWeights, TapRun};
-use super::winograd::PatchWeights;
+use super::bordered_convolution::{BorderedConvolution, PackedKernel, Written};
+use super::image_geometry::{ConvShape, ImageGeometry, TAPS};
+use super::packed::StartSums;
 use crate::nn::fused::{FusedOperation, Operand, apply};
 use crate::nn::tensors::{product, sum_columns, with_values};
-
-/// Side of the kernel.
-const SIDE: usize = 3;
-/// Weights of one input channel for one output channel.
-pub(in crate::nn) const TAPS: usize = SIDE * SIDE;
-
-/// How a convolution samples its input.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(in crate::nn) struct ConvShape {
-    /// Input places from one output place to the next.
-    pub(in crate::nn) stride: usize,
-    /// Input places from one tap of the kernel to the next.
-    pub(in crate::nn) dilation: usize,
-}
-
-impl ConvShape {
-    /// Every place, neighbours side by side.
-    pub(in crate::nn) const PLAIN: Self = Self { stride: 1, dilation: 1 };
-
-    /// Every second place: half the sides.
-    pub(in crate::nn) const HALVING: Self = Self { stride: 2, dilation: 1 };
-
-    /// Every place, neighbours `dilation` places apart.
-    pub(in crate::nn) const fn dilated(dilation: usize) -> Self {
-        Self { stride: 1, dilation }
-    }
-}
 
 /// A layer that is a 3×3 convolution of weight `[9 · C, O]`, taps row by row, and bias `[O]`.
 #[derive(Clone, Debug)]
@@ -50,24 +24,12 @@ pub(in crate::nn) struct Convolution3 {
     pub(in crate::nn) packed: Option<Arc<PackedKernel>>,
 }
 
-/// The weights of a convolution for prediction.
-#[derive(Debug)]
-pub(in crate::nn) struct PackedKernel {
-    /// For each place on its own.
-    pub(super) places: PackedWeights,
-    /// For tiles of 2×2 places, of a convolution without a stride.
-    pub(super) patches: Option<PatchWeights>,
-}
-
 impl Convolution3 {
     /// Packs the weights as they are now.
     pub(in crate::nn) fn pack(&mut self) -> Result<()> {
-        let kernel = |weights: &[f32], bias: &[f32]| PackedKernel {
-            places: PackedWeights::new(weights, bias),
-            patches: (self.shape.stride == 1).then(|| PatchWeights::new(weights, bias)),
-        };
+        let stride = self.shape.stride;
         let packed = with_values(&self.weight, |weights| {
-            with_values(&self.bias, |bias| kernel(weights, bias))
+            with_values(&self.bias, |bias| PackedKernel::new(weights, bias, stride))
         })??;
         self.packed = Some(Arc::new(packed));
         Ok(())
@@ -79,95 +41,6 @@ impl Module for Convolution3 {
     /// Errors: shapes that do not fit.
     fn forward(&self, x: &Tensor) -> Result<Tensor> {
         apply(self.shape, [x, &self.weight, &self.bias])
-    }
-}
-
-/// Sizes of one image of a convolution.
-#[derive(Clone, Copy)]
-pub(super) struct ImageGeometry {
-    pub(super) height: usize,
-    pub(super) width: usize,
-    pub(super) channels: usize,
-    pub(super) shape: ConvShape,
-}
-
-/// Output places that one matrix product computes.
-struct PlaceBlock {
-    /// The first row of output places.
-    row: usize,
-    /// Where the kernel of the first place begins, in the values of the bordered image.
-    from: usize,
-    /// Places, those that are not used included.
-    places: usize,
-}
-
-impl ImageGeometry {
-    pub(super) fn of((_, height, width, channels): (usize, usize, usize, usize), shape: ConvShape) -> Self {
-        Self {
-            height,
-            width,
-            channels,
-            shape,
-        }
-    }
-
-    pub(super) fn out_height(self) -> usize {
-        self.height.div_ceil(self.shape.stride)
-    }
-
-    pub(super) fn out_width(self) -> usize {
-        self.width.div_ceil(self.shape.stride)
-    }
-
-    pub(super) fn places(self) -> usize {
-        self.out_height() * self.out_width()
-    }
-
-    pub(super) fn inputs(self) -> usize {
-        self.height * self.width * self.channels
-    }
-
-    /// Places in a row of the bordered image: `dilation` more on each side.
-    pub(super) fn pitch(self) -> usize {
-        self.width + 2 * self.shape.dilation
-    }
-
-    /// Where the first place inside the border begins.
-    pub(super) fn inside(self) -> usize {
-        self.shape.dilation * (self.pitch() + 1) * self.channels
-    }
-
-    /// All output places. Without a stride they are one block, in which the borders between rows count as places.
-    fn blocks(self) -> impl Iterator<Item = PlaceBlock> {
-        let ConvShape { stride, dilation } = self.shape;
-        let count = if stride == 1 { 1 } else { self.out_height() };
-        (0..count).map(move |row| PlaceBlock {
-            row,
-            from: row * stride * self.pitch() * self.channels,
-            places: match stride {
-                1 => self.height * self.pitch() - 2 * dilation,
-                _ => self.out_width(),
-            },
-        })
-    }
-
-    /// The taps: whole rows of the kernel where they are neighbours.
-    pub(super) fn runs(self) -> impl Iterator<Item = TapRun> {
-        let (channels, dilation) = (self.channels, self.shape.dilation);
-        let columns = if dilation == 1 { 1 } else { SIDE };
-        (0..SIDE).flat_map(move |row| {
-            (0..columns).map(move |column| TapRun {
-                offset: (row * self.pitch() + column) * dilation * channels,
-                first: (row * SIDE + column) * channels,
-                length: SIDE / columns * channels,
-            })
-        })
-    }
-
-    /// The matrix of a run's values at the places of a block, one place a row.
-    fn neighbours(self, block: &PlaceBlock, run: &TapRun) -> Layout {
-        let steps = vec![self.shape.stride * self.channels, 1];
-        Layout::new(Shape::from((block.places, run.length)), steps, block.from + run.offset)
     }
 }
 
@@ -205,29 +78,6 @@ impl BorderedImage {
         }
     }
 
-    /// Adds the image's convolution to `sums` `[places, outputs]`. The weight begins at `from` in its storage.
-    fn add_convolution(&self, sums: &mut [f32], weight: &CpuStorage, from: usize) -> Result<()> {
-        let geometry = self.geometry;
-        let outputs = sums.len() / geometry.places();
-        let used = geometry.out_width() * outputs;
-        let pitch = match geometry.shape.stride {
-            1 => geometry.pitch() * outputs,
-            _ => used,
-        };
-        for block in geometry.blocks() {
-            for run in geometry.runs() {
-                let weights = Layout::contiguous_with_offset((run.length, outputs), from + run.first * outputs);
-                let neighbours = geometry.neighbours(&block, &run);
-                let product = product((&self.values, &neighbours), (weight, &weights))?;
-                let rows = sums[block.row * used..].chunks_exact_mut(used);
-                for (sums, product) in rows.zip(product.chunks(pitch)) {
-                    sum_columns(sums, &product[..used]);
-                }
-            }
-        }
-        Ok(())
-    }
-
     /// Adds the gradient of the weight `[9 · C, O]` to `sums`, from that of the image's convolution, which is spread over an
     /// image as large as this one. What is no output place has a gradient of zero.
     fn add_weight_gradient(&self, sums: &mut [f32], gradient: &Self) -> Result<()> {
@@ -257,12 +107,12 @@ impl FusedOperation<3> for ConvShape {
         if rows != taps {
             bail!("a convolution of {channels} channels takes {taps} rows of weights, got {rows}");
         }
-        let mut sums = bias.values.repeat(dims.0 * image.places());
-        let mut bordered = BorderedImage::new(image);
+        let kernel = PackedKernel::new(weight.values, bias.values, self.stride);
+        let convolution = BorderedConvolution::new(&kernel, image);
+        let mut sums = vec![0.0; dims.0 * image.places() * outputs];
         let images = x.values.chunks_exact(image.inputs());
         for (values, sums) in images.zip(sums.chunks_exact_mut(image.places() * outputs)) {
-            bordered.write(values, 1);
-            bordered.add_convolution(sums, weight.storage, weight.layout.start_offset())?;
+            convolution.forward(values, sums, StartSums::Bias, Written::Plain);
         }
         Ok((
             sums,
@@ -285,7 +135,9 @@ impl FusedOperation<3> for ConvShape {
             ..image
         };
         let (mut bordered, mut bordered_gradient) = (BorderedImage::new(image), BorderedImage::new(spread));
-        let turned = CpuStorage::F32(turned_kernel(weight.values, image.channels));
+        let turned = turned_kernel(weight.values, image.channels);
+        let turned = PackedKernel::new(&turned, &vec![0.0; image.channels], spread.shape.stride);
+        let convolution = BorderedConvolution::new(&turned, spread);
         let mut for_bias = vec![0.0; outputs];
         let mut for_weight = vec![0.0; weight.values.len()];
         let mut for_x = x.is_tracked.then(|| vec![0.0; x.values.len()]);
@@ -297,7 +149,7 @@ impl FusedOperation<3> for ConvShape {
             bordered.add_weight_gradient(&mut for_weight, &bordered_gradient)?;
             if let Some(for_x) = &mut for_x {
                 let for_x = &mut for_x[index * image.inputs()..(index + 1) * image.inputs()];
-                bordered_gradient.add_convolution(for_x, &turned, 0)?;
+                convolution.forward_bordered(bordered_gradient.values.as_slice()?, for_x);
             }
         }
         Ok([for_x, Some(for_weight), Some(for_bias)])

@@ -9,7 +9,7 @@
 
 use pulp::{Arch, Simd, WithSimd};
 
-use super::convolution::{ImageGeometry, TAPS};
+use super::image_geometry::{ImageGeometry, TAPS};
 use super::packed::{PackedWeights, StartSums, lanes};
 
 /// Values of a patch of 4×4 places, and matrices of weights.
@@ -331,7 +331,7 @@ fn sums<S: Simd>(simd: S, [first, second, third, fourth]: [S::f32s; 4]) -> [S::f
 mod tests {
     use super::*;
     use crate::nn::gradient_check::noise;
-    use crate::nn::ops::convolution::ConvShape;
+    use crate::nn::ops::image_geometry::ConvShape;
 
     #[test]
     fn tiles_give_the_sums_of_all_taps() {
