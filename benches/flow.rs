@@ -1,4 +1,4 @@
-//! Time of the shipped flow networks: a window, a step of a stream, and rollouts of many plans. The cases take turns, and the
+//! Time of the shipped flow networks: a window, a step of a stream, 8 windows together, and rollouts of many plans. The cases take turns, and the
 //! least of each is printed, since other programs run too.
 //!
 //! `cargo bench --bench flow [-- ROUNDS MODEL...]`; with `taskset -c 0` and `RAYON_NUM_THREADS=1` before it, on one core.
@@ -21,6 +21,7 @@ const ROUNDS: usize = 7;
 /// Of a window and of a step, in each round.
 const REPEATS: u32 = 20;
 const PLANS: [usize; 2] = [64, 256];
+const WINDOWS: usize = 8;
 
 /// A model with an input and a stream that has seen it.
 struct Bench {
@@ -68,6 +69,10 @@ impl Bench {
         predict(&self.model, &[&self.input]).unwrap();
     }
 
+    fn windows(&self) {
+        predict(&self.model, &[&self.input; WINDOWS]).unwrap();
+    }
+
     fn step(&mut self) {
         let (frame, plan) = (self.input.frames[0].clone(), self.input.plan.as_deref());
         self.session.step(frame, self.input.state.as_ref(), plan).unwrap();
@@ -104,26 +109,30 @@ fn main() {
         names.retain(|name| arguments.iter().any(|argument| argument == name));
     }
     let mut benches: Vec<Bench> = names.iter().map(|name| Bench::new(name)).collect();
-    let mut least = vec![[Duration::MAX; 4]; names.len()];
+    let mut least = vec![[Duration::MAX; 5]; names.len()];
     for _ in 0..rounds {
         for (bench, least) in benches.iter_mut().zip(&mut least) {
             let mut note = |case: usize, taken: Duration| least[case] = least[case].min(taken);
             note(0, timed(repeats, || bench.window()));
             note(1, timed(repeats, || bench.step()));
+            note(2, timed(repeats.div_ceil(4), || bench.windows()));
             if bench.input.plan.is_some() {
                 for (index, plans) in PLANS.into_iter().enumerate() {
-                    note(2 + index, timed(1, || bench.rollouts(plans)));
+                    note(3 + index, timed(1, || bench.rollouts(plans)));
                 }
             }
         }
     }
     for (name, least) in names.iter().zip(least) {
         let ms = least.map(|taken| taken.as_secs_f64() * 1e3);
-        println!("{name}: window {:.2} ms, step of a stream {:.2} ms", ms[0], ms[1]);
-        if least[2] < Duration::MAX {
+        println!(
+            "{name}: window {:.2} ms, step of a stream {:.2} ms, {WINDOWS} windows {:.2} ms",
+            ms[0], ms[1], ms[2]
+        );
+        if least[3] < Duration::MAX {
             println!(
                 "{name}: rollouts of 64 plans {:.0} ms, of 256 plans {:.0} ms",
-                ms[2], ms[3]
+                ms[3], ms[4]
             );
         }
     }

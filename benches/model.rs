@@ -78,6 +78,25 @@ fn prediction(c: &mut Criterion) {
     }
 }
 
+/// One frame of the context is new; the codes of the others are known.
+fn step(c: &mut Criterion) {
+    let spec = ModelSpec::default();
+    let parameters = Parameters::initialize(&spec, Seed(1)).unwrap();
+    let model = Network::detached(spec.clone(), &parameters).unwrap();
+    let known = values((1, spec.context - 1, spec.code_len()));
+    let frame = values((1, 1, spec.pixels())).squeeze(1).unwrap();
+    c.bench_function("dense step of a stream", |b| {
+        b.iter(|| {
+            let code = model.encode_frames(&frame).unwrap().unsqueeze(1).unwrap();
+            let codes = Tensor::cat(&[&known, &code], 1).unwrap();
+            let ahead = model
+                .predict(&codes, &ConditioningTensors::none(), Feedback::Prediction)
+                .unwrap();
+            model.decode_frames(&ahead.flatten(0, 1).unwrap()).unwrap()
+        });
+    });
+}
+
 /// Forward pass, backward pass and Adam: from pixels to pixels, or with a frozen codec from features to features.
 fn training(c: &mut Criterion) {
     let spec = ModelSpec::default();
@@ -124,7 +143,7 @@ fn training(c: &mut Criterion) {
 criterion_group! {
     name = model;
     config = Criterion::default().sample_size(20).measurement_time(std::time::Duration::from_secs(3));
-    targets = prediction, training
+    targets = prediction, step, training
 }
 
 fn main() {

@@ -54,13 +54,13 @@ def all_cases(models: Path) -> list[Case]:
     ]
     # The step encodes one frame of the context instead of all.
     saved = (CONTEXT - 1) * 64 * 64 * 128
-    found.append(Case("dense, a step of a stream", step, 1, products - saved))
-    benches = {("moving-flow", 1): "moving-flow window", ("rooms", 1): "rooms window"}
+    found.append(Case("dense, a step of a stream", step, 1, products - saved, "dense step of a stream"))
+    benches = {1: "window", 8: "8 windows"}
     for name, batches in (("moving-flow", (1, 8, 64)), ("rooms", (1, 8))):
         directory = ModelDirectory(models / name)
         model, products = export_onnx(models / name), HORIZON * directory.manifest["multiply_adds_per_frame"]
         for batch in batches:
-            bench = "flow prediction of 64 windows" if batch == 64 else benches.get((name, batch))
+            bench = f"{name} {benches[batch]}" if batch in benches else "flow prediction of 64 windows"
             found.append(Case(f"`{name}`, {batch} window{'s' * (batch > 1)}", model, batch, products * batch, bench))
     for title, (model, parameters), published, products in (
         ("ConvLSTM", conv_lstm(CONTEXT, HORIZON), CONV_LSTM_PARAMETERS, CONV_LSTM_MULTIPLY_ADDS),

@@ -33,11 +33,11 @@ class Foreframe:
         """Milliseconds by line."""
         found: dict[str, float] = {}
         for line in self._run(self.flow, "1").splitlines():
-            if match := re.match(r"(\S+): window (\S+) ms, step", line):
-                found[f"{match[1]} window"] = float(match[2])
+            if match := re.match(r"(\S+): window (\S+) ms, step of a stream \S+ ms, 8 windows (\S+) ms", line):
+                found[f"{match[1]} window"], found[f"{match[1]} 8 windows"] = float(match[2]), float(match[3])
         options = ["--bench", "--noplot", "--warm-up-time", "0.5", "--measurement-time", "1", "--sample-size", "10"]
-        printed = self._run(self.model, *options, "prediction")
-        for line in re.finditer(r"^(.* windows)\s+time:\s+\[\S+ \S+ (\S+) (\S+) ", printed, re.MULTILINE):
+        printed = self._run(self.model, *options, "prediction|step of a stream")
+        for line in re.finditer(r"^(.*(?:windows|a stream))\s+time:\s+\[\S+ \S+ (\S+) (\S+) ", printed, re.MULTILINE):
             found[line[1]] = float(line[2]) * _UNIT_MS[line[3]]
         return found
 

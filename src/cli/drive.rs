@@ -2,9 +2,11 @@
 
 use std::io::{IsTerminal as _, Write as _};
 use std::path::PathBuf;
+use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 use super::error::CliError;
+use super::interrupt;
 use super::output::OutputDirectory;
 use super::process::print_line;
 use super::settings::CommonArgs;
@@ -25,9 +27,9 @@ use foreframe_train::evaluation::figures::episode_animation::episode_gif;
 /// itself as the model: the upper limit.
 ///
 /// Goals can be reached on a straight line, but for the other robots. All drivers know where the goal is. The
-/// table has means over the episodes with 95 % bootstrap intervals. Of the collisions, (standing) are those in which the robot stood or
-/// turned on the spot, (unseen) those with a robot that its camera had not shown in the two seconds before. Episodes run side by side on all
-/// cores.
+/// table has means over the episodes with 95 % bootstrap intervals; "per km" are all collisions over all ways. Of the collisions,
+/// (standing) are those in which the robot stood or turned on the spot, (unseen) those with a robot that its camera had not shown in the
+/// two seconds before. Episodes run side by side on all cores. After Ctrl-C, the table is of the episodes that are over.
 ///
 /// With --out, writes drive.json (the scores and all episodes) and three GIFs for each driver: its best, its median and its worst
 /// episode, as in pid-best.gif. Those with a success come first, then those with fewer collisions, then the shorter ones. A GIF shows the
@@ -92,7 +94,8 @@ pub(super) fn run(args: &DriveArgs) -> Result<(), CliError> {
         budget: args.budget_ms.map(Duration::from_millis),
     };
     let shows_progress = std::io::stderr().is_terminal();
-    let scores = drive::run(model, &settings, &|driver, episode| {
+    let is_stopped = interrupt::flag()?;
+    let scores = drive::run(model, &settings, &is_stopped, &|driver, episode| {
         if shows_progress {
             // Progress that cannot be shown does not stop a drive.
             let _ = write!(
@@ -108,6 +111,20 @@ pub(super) fn run(args: &DriveArgs) -> Result<(), CliError> {
         let _ = writeln!(std::io::stderr());
     }
     let scores = scores?;
+    let driven: Vec<String> = (scores.iter())
+        .map(|of_driver| format!("{} {}", of_driver.driver.name(), of_driver.episodes.len()))
+        .collect();
+    let interrupted = is_stopped.load(Ordering::Relaxed).then(|| {
+        let driven = if driven.is_empty() {
+            "none".to_owned()
+        } else {
+            driven.join(", ")
+        };
+        CliError::Interrupted(format!(
+            "stopped; episodes of {} that are over: {driven}",
+            args.episodes
+        ))
+    });
     if args.json {
         print_line(serde_json::to_string(&scores).map_err(CliError::failed)?)?;
     } else {
@@ -117,9 +134,10 @@ pub(super) fn run(args: &DriveArgs) -> Result<(), CliError> {
         .map(|output| write_files(output, model, &settings, &scores))
         .transpose()?;
     match (&args.out, files) {
-        (Some(out), Some(files)) if !args.json => print_line(format!("{}: {}", out.display(), files.join(", "))),
-        _ => Ok(()),
+        (Some(out), Some(files)) if !args.json => print_line(format!("{}: {}", out.display(), files.join(", ")))?,
+        _ => {}
     }
+    interrupted.map_or(Ok(()), Err)
 }
 
 /// Writes the scores and the GIFs; returns the names of the files.
@@ -148,6 +166,7 @@ fn print_table(scores: &[DriverScores]) -> Result<(), CliError> {
         "driver",
         "success",
         "collisions",
+        "per km",
         "(standing)",
         "(unseen)",
         "time s",
@@ -156,19 +175,20 @@ fn print_table(scores: &[DriverScores]) -> Result<(), CliError> {
         "stops",
         "choice ms (p50, p95)",
     ];
-    let rows: Vec<[String; 10]> = scores.iter().map(row).collect();
+    let rows: Vec<[String; 11]> = scores.iter().map(row).collect();
     for line in aligned(header, &rows) {
         print_line(line)?;
     }
     Ok(())
 }
 
-fn row(scores: &DriverScores) -> [String; 10] {
+fn row(scores: &DriverScores) -> [String; 11] {
     let [median, late] = scores.planning_ms;
     [
         scores.driver.name().to_owned(),
         text(&scores.success),
         text(&scores.collisions),
+        format!("{:.0}", scores.collisions_per_km.mean),
         format!("{:.2}", scores.while_standing.mean),
         format!("{:.2}", scores.unseen.mean),
         text(&scores.time_s),

@@ -14,7 +14,14 @@ const USED_IN: &[(&str, &[&str])] = &[
             "crates/train/src",
         ],
     ),
-    ("pulp", &["crates/core/src/vectorized", "crates/core/src/nn/ops/packed"]),
+    (
+        "pulp",
+        &[
+            "crates/core/src/vectorized",
+            "crates/core/src/nn/ops/packed",
+            "crates/core/src/nn/ops/winograd",
+        ],
+    ),
     ("axum", &["src/server"]),
     ("hyper", &["src/server"]),
     ("figment", &["crates/train/src/settings"]),

@@ -23,6 +23,7 @@ pub mod method;
 pub mod metrics;
 mod novelty_scale;
 mod output;
+pub mod pixel_class;
 pub mod plans;
 mod progress;
 pub mod ranking;
@@ -34,7 +35,7 @@ mod statistics;
 pub mod surroundings;
 pub mod uncertainty;
 mod verdict;
-pub mod visibility;
+mod visibility;
 mod windows;
 
 use std::time::Instant;

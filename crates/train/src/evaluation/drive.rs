@@ -13,7 +13,7 @@ mod simulated;
 mod situation;
 mod tracks;
 
-use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::thread;
 
 use foreframe_core::registry::Model;
@@ -24,11 +24,13 @@ pub use self::scores::{DriveScore, DriverScores};
 pub use self::settings::{DriveSettings, DriverKind};
 
 /// Drives every episode with every driver, side by side on all cores. `model`: needed by those that see or plan with one.
-/// `on_episode` is called after each episode of a driver, with how many are over. Errors: a driver without the model that it needs, a
+/// `on_episode` is called after each episode of a driver, with how many are over. Once `is_stopped`, no episode begins: the scores
+/// are then of those that are over, and drivers without one are left out. Errors: a driver without the model that it needs, a
 /// scenario in which Tb1 does not drive, those of the simulator and of the predictions.
 pub fn run(
     model: Option<&Model>,
     settings: &DriveSettings,
+    is_stopped: &AtomicBool,
     on_episode: &(dyn Fn(DriverKind, usize) + Sync),
 ) -> Result<Vec<DriverScores>, DriveError> {
     settings.check(model)?;
@@ -38,6 +40,9 @@ pub fn run(
         let drive = || {
             let mut results = Vec::new();
             loop {
+                if is_stopped.load(Ordering::Relaxed) {
+                    return Ok(results);
+                }
                 let episode = next.fetch_add(1, Ordering::Relaxed);
                 if episode >= settings.episodes {
                     return Ok(results);
@@ -60,8 +65,10 @@ pub fn run(
         })?
         .concat();
         results.sort_by_key(|(episode, _)| *episode);
-        let results = results.into_iter().map(|(_, result)| result).collect();
-        scores.push(DriverScores::new(driver, results, settings.seed));
+        let results: Vec<EpisodeResult> = results.into_iter().map(|(_, result)| result).collect();
+        if !results.is_empty() {
+            scores.push(DriverScores::new(driver, results, settings.seed));
+        }
     }
     Ok(scores)
 }
@@ -98,7 +105,7 @@ mod tests {
 
     #[test]
     fn the_straight_driver_arrives_and_the_same_seed_gives_the_same_drive() {
-        let run = || run(None, &settings(&[DriverKind::Pid]), &|_, _| {}).unwrap();
+        let run = || run(None, &settings(&[DriverKind::Pid]), &AtomicBool::new(false), &|_, _| {}).unwrap();
         let scores = run();
         let results = &scores[0].episodes;
         assert!(results.iter().any(|result| result.arrived), "{results:?}");
@@ -115,7 +122,7 @@ mod tests {
         let mut settings = settings(&[DriverKind::Pid, DriverKind::Simulator]);
         settings.scenario = Scenario::Crowded;
         settings.duration_s = 12.0;
-        let scores = run(None, &settings, &|_, _| {}).unwrap();
+        let scores = run(None, &settings, &AtomicBool::new(false), &|_, _| {}).unwrap();
         let collisions = |scores: &DriverScores| scores.episodes.iter().map(|result| result.collisions).sum::<usize>();
         assert!(collisions(&scores[1]) <= collisions(&scores[0]), "{scores:?}");
         let shortest = |scores: &DriverScores| scores.episodes.iter().map(|r| r.shortest_m).collect::<Vec<_>>();
@@ -123,14 +130,38 @@ mod tests {
     }
 
     #[test]
+    fn a_stopped_drive_gives_the_scores_of_what_is_over() {
+        let settings = DriveSettings {
+            episodes: 20,
+            ..settings(&[DriverKind::Pid, DriverKind::Simulator])
+        };
+        let is_stopped = AtomicBool::new(false);
+        let scores = run(None, &settings, &is_stopped, &|_, over| {
+            is_stopped.store(over >= 2, Ordering::Relaxed);
+        })
+        .unwrap();
+        let episodes = scores[0].episodes.len();
+        assert!(scores.len() == 1 && (2..20).contains(&episodes), "{episodes}");
+        let whole = DriveSettings { episodes, ..settings };
+        let again = run(None, &whole, &AtomicBool::new(false), &|_, _| {}).unwrap();
+        assert_eq!(again[0].episodes, scores[0].episodes);
+    }
+
+    #[test]
     fn a_driver_without_its_model_is_refused() {
-        let error = run(None, &settings(&[DriverKind::Plan]), &|_, _| {}).unwrap_err();
+        let error = run(
+            None,
+            &settings(&[DriverKind::Plan]),
+            &AtomicBool::new(false),
+            &|_, _| {},
+        )
+        .unwrap_err();
         assert_eq!(error.to_string(), "driver plan needs a model; name one");
         let still = DriveSettings {
             scenario: Scenario::StaticObserver,
             ..settings(&[DriverKind::Pid])
         };
-        let error = run(None, &still, &|_, _| {}).unwrap_err();
+        let error = run(None, &still, &AtomicBool::new(false), &|_, _| {}).unwrap_err();
         assert!(error.to_string().contains("static-observer"), "{error}");
     }
 }

@@ -7,8 +7,8 @@ use super::actions::Variant;
 use super::bootstrap::{CONFIDENCE, FEWEST_GROUPS};
 use super::method::Method;
 use super::metrics::PSNR_CAP_DB;
+use super::pixel_class::PixelClass;
 use super::report::{EvaluationReport, SetScores};
-use super::visibility::PixelClass;
 
 /// Squared errors are shown in this unit.
 const MSE_UNIT: f64 = 1e-4;

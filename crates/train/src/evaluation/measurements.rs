@@ -6,6 +6,7 @@ use super::baselines::Baselines;
 use super::bootstrap::is_recording;
 use super::forecast::{Forecast, forecasts};
 use super::metrics::{WindowScores, add_benchmark};
+use super::pixel_class::{self, ClassSums};
 use super::plans;
 use super::progress::EvaluationContext;
 use super::ranking;
@@ -13,7 +14,7 @@ use super::report::SetScores;
 use super::score::score;
 use super::surroundings::{self, SurroundingsMeasurements};
 use super::uncertainty;
-use super::visibility::{self, ClassSums};
+use super::visibility;
 use foreframe_data::dataset::Window;
 
 /// What was measured of the windows of a set; in a part, of its share of them.
@@ -82,7 +83,7 @@ impl Measurements {
             scores.ranking = ranking::rates(evaluation, windows, &group_of, &found.ranking, &bootstrap);
         }
         scores.surroundings = self.surroundings.map(SurroundingsMeasurements::scores);
-        scores.visibility = visibility::scores(baselines.methods(), self.visibility);
+        scores.visibility = pixel_class::scores(baselines.methods(), self.visibility);
         let mut novelty = Vec::new();
         if let (Some(calibration), Some(found)) = (&inference.loaded.manifest.calibration, &self.forecasts) {
             let (measured, found) = uncertainty::scores(calibration, found);

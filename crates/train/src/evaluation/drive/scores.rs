@@ -30,6 +30,8 @@ pub struct DriverScores {
     pub arrived: DriveScore,
     /// Collisions of an episode.
     pub collisions: DriveScore,
+    /// Collisions of a kilometre: all collisions over all ways.
+    pub collisions_per_km: DriveScore,
     /// Collisions in which the robot did not drive forward.
     pub while_standing: DriveScore,
     /// Collisions with a robot that the camera had not shown in the two seconds before.
@@ -80,6 +82,7 @@ impl DriverScores {
                 result.stops as f64,
                 result.while_standing as f64,
                 result.unseen as f64,
+                result.way_m,
             ]
         };
         let own: Vec<usize> = (0..episodes.len()).collect();
@@ -88,7 +91,13 @@ impl DriverScores {
             samples: RESAMPLES,
             seed,
         };
-        let (means, intervals) = (sums.means(), sums.intervals(&bootstrap, <[f64]>::to_vec));
+        let with_rate = |means: &[f64]| {
+            let mut values = means.to_vec();
+            // Collisions over ways; a robot that never moved counts as if it had gone a millimetre.
+            values.extend(means.get(9).map(|way_m| 1000.0 * means[2] / way_m.max(0.001)));
+            values
+        };
+        let (means, intervals) = (with_rate(&sums.means()), sums.intervals(&bootstrap, with_rate));
         let score = |index: usize| DriveScore {
             mean: means.get(index).copied().unwrap_or(f64::NAN),
             interval: intervals.as_ref().map(|all| all[index]),
@@ -107,6 +116,7 @@ impl DriverScores {
             success: score(0),
             arrived: score(1),
             collisions: score(2),
+            collisions_per_km: score(10),
             while_standing: score(7),
             unseen: score(8),
             time_s: score(3),
@@ -145,6 +155,8 @@ mod tests {
             (0.5, 0.75, 0.5)
         );
         assert_eq!(scores.spl.mean, 0.25);
+        // Two collisions on 16 m.
+        assert_eq!(scores.collisions_per_km.mean, 125.0);
         let interval = scores.success.interval.unwrap();
         assert!(interval.low < 0.5 && interval.high > 0.5);
     }
