@@ -28,6 +28,7 @@ pub enum EvaluationStage {
     /// How far away things are.
     Depth,
     /// Where the error sits.
+    #[doc(hidden)]
     Visibility,
     /// Expected errors and novelty.
     Calibration,

@@ -130,7 +130,7 @@ impl<'a> TiledConvolution<'a> {
                 bordered,
                 image: self.image,
                 tiles,
-                patches: all_patches,
+                planes: all_patches,
             });
             let planes = all_patches.chunks_exact(plane(tiles.len(), channels));
             let sums = all_products.chunks_exact_mut(plane(tiles.len(), outputs));
@@ -163,7 +163,7 @@ struct Patches<'a> {
     bordered: &'a [f32],
     image: ImageGeometry,
     tiles: &'a [Tile],
-    patches: &'a mut [f32],
+    planes: &'a mut [f32],
 }
 
 impl WithSimd for Patches<'_> {
@@ -218,10 +218,10 @@ impl Patches<'_> {
         let plane = plane(self.tiles.len(), self.image.channels);
         let [first, second, third, fourth] = turned_values(simd, values);
         let to = to + column * plane;
-        set_vector::<S>(self.patches, to, first);
-        set_vector::<S>(self.patches, to + 4 * plane, second);
-        set_vector::<S>(self.patches, to + 8 * plane, third);
-        set_vector::<S>(self.patches, to + 12 * plane, fourth);
+        set_vector::<S>(self.planes, to, first);
+        set_vector::<S>(self.planes, to + 4 * plane, second);
+        set_vector::<S>(self.planes, to + 8 * plane, third);
+        set_vector::<S>(self.planes, to + 12 * plane, fourth);
     }
 }
 
