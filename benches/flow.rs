@@ -102,12 +102,15 @@ fn main() {
         (rounds.unwrap_or(ROUNDS), REPEATS)
     };
     let mut names = vec!["moving-flow", "rooms", "static-flow"];
-    if names
-        .iter()
-        .any(|name| arguments.iter().any(|argument| argument == name))
-    {
-        names.retain(|name| arguments.iter().any(|argument| argument == name));
-    }
+    let is_option = |argument: &&String| argument.starts_with('-') || argument.parse::<usize>().is_ok();
+    let asked: Vec<&String> = arguments[1..].iter().filter(|argument| !is_option(argument)).collect();
+    let unknown = asked.iter().find(|name| !names.contains(&name.as_str()));
+    assert!(
+        unknown.is_none(),
+        "there is no {unknown:?}; there are: {}",
+        names.join(", ")
+    );
+    names.retain(|name| asked.is_empty() || asked.iter().any(|asked| asked == name));
     let mut benches: Vec<Bench> = names.iter().map(|name| Bench::new(name)).collect();
     let mut least = vec![[Duration::MAX; 5]; names.len()];
     for _ in 0..rounds {

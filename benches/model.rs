@@ -62,7 +62,9 @@ fn specs() -> [(&'static str, ModelSpec); 2] {
 fn prediction(c: &mut Criterion) {
     for (name, spec) in specs() {
         let parameters = Parameters::initialize(&spec, Seed(1)).unwrap();
-        let model = Network::detached(spec.clone(), &parameters).unwrap();
+        let model = Network::detached(spec.clone(), &parameters)
+            .and_then(Network::packed)
+            .unwrap();
         for windows in [1, WINDOWS] {
             let frames = values((windows, spec.context, spec.pixels()));
             let zeros = |shape: &[usize]| Tensor::zeros(shape, DType::F32, &Device::Cpu).unwrap();

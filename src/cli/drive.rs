@@ -2,7 +2,6 @@
 
 use std::io::{IsTerminal as _, Write as _};
 use std::path::PathBuf;
-use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 use super::error::CliError;
@@ -27,9 +26,10 @@ use foreframe_train::evaluation::figures::episode_animation::episode_gif;
 /// itself as the model: the upper limit.
 ///
 /// Goals can be reached on a straight line, but for the other robots. All drivers know where the goal is. The
-/// table has means over the episodes with 95 % bootstrap intervals; "per km" are all collisions over all ways. Of the collisions,
+/// table has means over the episodes with 95 % bootstrap intervals; "per km" are all collisions divided by the total distance. Of the collisions,
 /// (standing) are those in which the robot stood or turned on the spot, (unseen) those with a robot that its camera had not shown in the
-/// two seconds before. Episodes run side by side on all cores. After Ctrl-C, the table is of the episodes that are over.
+/// two seconds before. Episodes run side by side on all cores. After Ctrl-C, the table is of
+/// the episodes that are finished, which are fewer for later drivers (column "episodes"), and no GIFs are drawn.
 ///
 /// With --out, writes drive.json (the scores and all episodes) and three GIFs for each driver: its best, its median and its worst
 /// episode, as in pid-best.gif. Those with a success come first, then those with fewer collisions, then the shorter ones. A GIF shows the
@@ -111,46 +111,41 @@ pub(super) fn run(args: &DriveArgs) -> Result<(), CliError> {
         let _ = writeln!(std::io::stderr());
     }
     let scores = scores?;
-    let driven: Vec<String> = (scores.iter())
-        .map(|of_driver| format!("{} {}", of_driver.driver.name(), of_driver.episodes.len()))
-        .collect();
-    let interrupted = is_stopped.load(Ordering::Relaxed).then(|| {
-        let driven = if driven.is_empty() {
-            "none".to_owned()
-        } else {
-            driven.join(", ")
-        };
-        CliError::Interrupted(format!(
-            "stopped; episodes of {} that are over: {driven}",
-            args.episodes
-        ))
-    });
+    let finished: usize = scores.iter().map(|of_driver| of_driver.episodes.len()).sum();
+    let asked = settings.episodes * settings.drivers.len();
+    let is_whole = finished == asked;
     if args.json {
         print_line(serde_json::to_string(&scores).map_err(CliError::failed)?)?;
     } else {
         print_table(&scores)?;
     }
+    let drawn = if is_whole { &scores[..] } else { &[] };
     let files = output
-        .map(|output| write_files(output, model, &settings, &scores))
+        .map(|output| write_files(output, model, &settings, (&scores, drawn)))
         .transpose()?;
     match (&args.out, files) {
         (Some(out), Some(files)) if !args.json => print_line(format!("{}: {}", out.display(), files.join(", ")))?,
         _ => {}
     }
-    interrupted.map_or(Ok(()), Err)
+    if is_whole {
+        return Ok(());
+    }
+    Err(CliError::Interrupted(format!(
+        "stopped; {finished} of {asked} episodes are finished"
+    )))
 }
 
-/// Writes the scores and the GIFs; returns the names of the files.
+/// Writes the scores, and the GIFs of the drivers that are `drawn`; returns the names of the files.
 fn write_files(
     output: OutputDirectory,
     model: Option<&Model>,
     settings: &DriveSettings,
-    scores: &[DriverScores],
+    (scores, drawn): (&[DriverScores], &[DriverScores]),
 ) -> Result<Vec<String>, CliError> {
     let text = serde_json::to_string_pretty(scores).map_err(CliError::failed)?;
     let mut files = vec!["drive.json".to_owned()];
     output.write("drive.json", format!("{text}\n").as_bytes())?;
-    for of_driver in scores {
+    for of_driver in drawn {
         for (rank, episode) in of_driver.examples() {
             let file = format!("{}-{rank}.gif", of_driver.driver.name());
             output.write(&file, &episode_gif(model, settings, of_driver.driver, episode)?)?;
@@ -164,6 +159,7 @@ fn write_files(
 fn print_table(scores: &[DriverScores]) -> Result<(), CliError> {
     let header = [
         "driver",
+        "episodes",
         "success",
         "collisions",
         "per km",
@@ -175,17 +171,18 @@ fn print_table(scores: &[DriverScores]) -> Result<(), CliError> {
         "stops",
         "choice ms (p50, p95)",
     ];
-    let rows: Vec<[String; 11]> = scores.iter().map(row).collect();
+    let rows: Vec<[String; 12]> = scores.iter().map(row).collect();
     for line in aligned(header, &rows) {
         print_line(line)?;
     }
     Ok(())
 }
 
-fn row(scores: &DriverScores) -> [String; 11] {
+fn row(scores: &DriverScores) -> [String; 12] {
     let [median, late] = scores.planning_ms;
     [
         scores.driver.name().to_owned(),
+        scores.episodes.len().to_string(),
         text(&scores.success),
         text(&scores.collisions),
         format!("{:.0}", scores.collisions_per_km.mean),

@@ -1,4 +1,4 @@
-//! What a pixel to come shows: what the last frame shows too, what only an earlier frame shows, what no frame shows, or a robot. And
+//! What a pixel of a future frame shows: what the last frame shows too, what only an earlier frame shows, what no frame shows, or a robot. And
 //! the errors of each of these classes.
 
 use serde::{Deserialize, Serialize};
@@ -11,7 +11,7 @@ const DEPTH_TOLERANCE: f32 = 0.03;
 /// A point's place in a frame is inside it from this depth on, in metres.
 const NEAREST_M: f32 = 0.01;
 
-/// What a pixel to come shows.
+/// What a pixel of a future frame shows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum PixelClass {
@@ -49,7 +49,7 @@ pub(super) const CLASSES: [PixelClass; 4] = [
 /// Errors by what a pixel shows, over all steps.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct VisibilityScores {
-    /// Windows whose pixels were told apart.
+    /// Windows whose pixels were classified.
     pub windows: usize,
     /// What the columns are: the order of the lists below.
     pub classes: Vec<PixelClass>,
@@ -64,8 +64,8 @@ pub struct VisibilityScores {
 pub struct VisibilityErrors {
     /// Who predicted.
     pub method: Method,
-    /// Mean squared error in each class; 0 in a class without pixels.
-    pub mse: Vec<f64>,
+    /// Mean squared error in each class; absent in a class without pixels.
+    pub mse: Vec<Option<f64>>,
 }
 
 /// Pixels and sums of squared errors of a window, class by class.
@@ -76,14 +76,15 @@ pub(super) struct ClassSums {
     pub(super) errors: Vec<[f64; CLASSES.len()]>,
 }
 
-/// The scores of all windows; `None` where the simulator could not tell.
+/// The scores of all windows; `None` if the simulator could not replay one of them.
 pub(super) fn scores(methods: &[Method], windows: Vec<Option<ClassSums>>) -> Option<VisibilityScores> {
     let windows = windows.into_iter().collect::<Option<Vec<_>>>()?;
     let pixels = CLASSES.map(|class| windows.iter().map(|window| window.pixels[class as usize]).sum::<u64>());
     let all = pixels.iter().sum::<u64>() as f64;
     let mse = |row: usize, class: PixelClass| {
         let sum: f64 = windows.iter().map(|window| window.errors[row][class as usize]).sum();
-        sum / pixels[class as usize].max(1) as f64
+        let pixels = pixels[class as usize];
+        (pixels > 0).then(|| sum / pixels as f64)
     };
     let rows = methods.iter().enumerate().map(|(row, &method)| VisibilityErrors {
         method,
@@ -232,9 +233,13 @@ mod tests {
         )
         .unwrap();
         assert_eq!(found.shares, [0.75, 0.0, 0.125, 0.125]);
-        for (mse, expected) in found.methods[0].mse.iter().zip([0.05, 0.0, 0.4, 0.2]) {
-            assert!((mse - expected).abs() < 1e-12);
-        }
+        let expected = [Some(0.05), None, Some(0.4), Some(0.2)];
+        let thousandths = |mse: &Option<f64>| mse.map(|mse| (1000.0 * mse).round());
+        let found = &found.methods[0].mse;
+        assert!(
+            found.iter().map(thousandths).eq(expected.iter().map(thousandths)),
+            "{found:?}"
+        );
         assert!(scores(&[Method::Model], vec![None]).is_none() && scores(&[Method::Model], Vec::new()).is_none());
     }
 }

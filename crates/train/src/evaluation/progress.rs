@@ -27,7 +27,7 @@ pub enum EvaluationStage {
     Surroundings,
     /// How far away things are.
     Depth,
-    /// Where the error sits.
+    /// Errors by what a pixel shows.
     #[doc(hidden)]
     Visibility,
     /// Expected errors and novelty.

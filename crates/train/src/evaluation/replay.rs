@@ -4,9 +4,10 @@ use super::EvaluationError;
 use super::inference::Inference;
 use super::windows::true_frame;
 use foreframe_core::frame::preprocess::scale;
-use foreframe_core::frame::quality;
+use foreframe_core::frame::{Frame, quality};
+use foreframe_core::nn::ModelSpec;
 use foreframe_core::types::Action;
-use foreframe_data::dataset::{Dataset, Window};
+use foreframe_data::dataset::{Dataset, DatasetInfo, Window};
 use foreframe_sim::camera::Camera;
 use foreframe_sim::{World, WorldConfig};
 
@@ -48,10 +49,14 @@ pub(super) fn replayed_views(
         if frame > window.first_frame {
             replay.step(&action(dataset, frame - 1)?)?;
         }
+        let seen = replay.observe();
+        if differs(&seen.frame, dataset, frame)? {
+            return Ok(None);
+        }
         views.push(ReplayedView {
             camera: replay.camera(),
             depths_m: replay.depths(),
-            robots: replay.observe().mask,
+            robots: seen.mask,
         });
     }
     Ok(Some(views))
@@ -68,13 +73,23 @@ fn replayed_to(
     let Some(trial) = &episode.trial else {
         return Ok(None);
     };
-    let recorded = true_frame(dataset, last)?;
     let mut replay = World::from_parameters(trial.clone(), world)?;
     for frame in episode.first_frame..last {
         replay.step(&action(dataset, frame)?)?;
     }
-    let differs = quality::mse(&scale(replay.observe().frame.pixels()), &recorded) > REPLAY_TOLERANCE;
+    let differs = differs(&replay.observe().frame, dataset, last)?;
     Ok((!differs).then_some(replay))
+}
+
+/// Whether a replayed frame is not the recorded one.
+fn differs(replayed: &Frame, dataset: &Dataset, frame: usize) -> Result<bool, EvaluationError> {
+    let recorded = true_frame(dataset, frame)?;
+    Ok(quality::mse(&scale(replayed.pixels()), &recorded) > REPLAY_TOLERANCE)
+}
+
+/// Whether frames need no resizing, which masks and depths do not get.
+pub(super) fn has_size_of(info: &DatasetInfo, spec: &ModelSpec) -> bool {
+    (info.frame_width_px, info.frame_height_px) == (spec.frame_width_px, spec.frame_height_px)
 }
 
 /// The action that was carried out from a frame on.

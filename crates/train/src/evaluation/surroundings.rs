@@ -7,10 +7,9 @@ use super::EvaluationError;
 use super::inference::Inference;
 use super::metrics::StepCurve;
 use super::progress::{EvaluationContext, EvaluationStage, Pass};
-use super::replay::replayed;
+use super::replay::{has_size_of, replayed};
 use super::windows::evenly;
-use foreframe_core::nn::ModelSpec;
-use foreframe_data::dataset::{DatasetInfo, Window};
+use foreframe_data::dataset::Window;
 
 /// Contexts at most whose depth is compared, evenly spread over the windows.
 const MAX_DEPTH_CONTEXTS: usize = 60;
@@ -192,11 +191,6 @@ fn mover_scores(batches: Vec<Option<Vec<MaskCounts>>>) -> Option<MoverScores> {
         recall_of_visible: curve(|counts| ratio(counts.visible_found, counts.visible)),
         iou: curve(|counts| counts.score().iou),
     })
-}
-
-/// Whether frames need no resizing, which masks and depths do not get.
-fn has_size_of(info: &DatasetInfo, spec: &ModelSpec) -> bool {
-    (info.frame_width_px, info.frame_height_px) == (spec.frame_width_px, spec.frame_height_px)
 }
 
 /// For each robot's id, whether a mask shows it.

@@ -1,4 +1,4 @@
-//! Where the error sits: the errors of model and baselines by what a pixel to come shows.
+//! The errors of model and baselines by what a pixel of a future frame shows.
 
 use rayon::prelude::*;
 
@@ -8,16 +8,17 @@ use super::inference::{ActionSource, Inference};
 use super::method::Method;
 use super::pixel_class::{CLASSES, ClassSums, PixelClass, classes};
 use super::progress::{EvaluationContext, EvaluationStage, Pass};
-use super::replay::replayed_views;
+use super::replay::{has_size_of, replayed_views};
 use super::windows::{evenly, true_frame, window_shape};
 use foreframe_data::dataset::{DatasetError, Window};
 use foreframe_sim::WorldConfig;
 
-/// Windows at most whose pixels are told apart, evenly spread.
+/// Windows at most whose pixels are classified, evenly spread.
 const MAX_WINDOWS: usize = 200;
 /// Windows that are computed together.
 const BATCH: usize = 8;
-/// Tells the pixels of some of the windows apart; nothing for a recording. `None` where the simulator cannot tell. Errors: those of the
+
+/// Classifies the pixels of some of the windows; nothing for a recording. `None` for a window that the simulator cannot replay. Errors: those of the
 /// network and the simulator, `Cancelled`, `Io`.
 pub(super) fn measure(
     evaluation: &EvaluationContext,
@@ -26,9 +27,7 @@ pub(super) fn measure(
 ) -> Result<Vec<Option<ClassSums>>, EvaluationError> {
     let inference = evaluation.inference;
     let (info, spec) = (inference.dataset.info(), inference.spec());
-    // Depths are not resized.
-    let is_same_size = (info.frame_width_px, info.frame_height_px) == (spec.frame_width_px, spec.frame_height_px);
-    let Some(world) = info.world.as_ref().filter(|_| is_same_size) else {
+    let Some(world) = info.world.as_ref().filter(|_| has_size_of(info, spec)) else {
         return Ok(Vec::new());
     };
     let pass = Pass {

@@ -1,7 +1,7 @@
 //! Predicts the rollouts of a batch with the flow network, in any of its forms, on all threads of the pool that it is called in.
 //!
 //! What depends only on the context is computed once for all rollouts that follow it. Without gradients, each step is then computed
-//! on its own, so that what lies between two layers stays in the processor's cache, many rollouts take no more memory than few, and
+//! on its own (but in the recurrent form, where a step needs the one before), so that what lies between two layers stays in the processor's cache, many rollouts take no more memory than few, and
 //! a single one is computed by several threads too.
 
 use std::ops::Range;

@@ -31,7 +31,7 @@ pub(super) struct PredictedAhead {
     pub(super) frames: Tensor,
     /// `[N, steps, P]`; `None` where the model remembers no scene.
     pub(super) scene: Option<Tensor>,
-    /// Where movers will be, as logits `[N, steps, P]`; `None` where the model does not tell.
+    /// Where movers will be, as logits `[N, steps, P]`; `None` where the model does not find movers.
     pub(super) movers: Option<Tensor>,
 }
 
@@ -70,17 +70,17 @@ impl<'a> StepsAhead<'a> {
 
     /// How the camera will have moved, `[M, 3]`.
     pub(super) fn motion(&self) -> Result<Tensor, NnError> {
-        self.asked(&self.known.motion)
+        self.of_these_steps(&self.known.motion)
     }
 
     /// Scales and shifts, `[M, …]`.
     pub(super) fn modulation(&self) -> Result<Tensor, NnError> {
-        self.asked(&self.known.modulation)
+        self.of_these_steps(&self.known.modulation)
     }
 
-    fn asked(&self, of_steps: &Tensor) -> Result<Tensor, NnError> {
-        let asked = of_steps.narrow(1, self.steps.start, self.steps.len())?;
-        Ok(asked.flatten(0, 1)?)
+    fn of_these_steps(&self, of_all: &Tensor) -> Result<Tensor, NnError> {
+        let these = of_all.narrow(1, self.steps.start, self.steps.len())?;
+        Ok(these.flatten(0, 1)?)
     }
 
     /// Where the camera stands at the last frame of each item's context, and where it will stand.

@@ -13,23 +13,35 @@ use crate::vectorized::vectorized;
 /// The weights of a convolution.
 #[derive(Debug)]
 pub(in crate::nn) struct PackedKernel {
+    outputs: usize,
     /// For each place on its own.
-    places: PackedWeights,
+    places: Option<PackedWeights>,
     /// For tiles of 2×2 places, of a convolution without a stride.
     patches: Option<PatchWeights>,
 }
 
 impl PackedKernel {
-    /// Of weights `[9 · C, O]` and a bias `[O]`.
+    /// For images of any size: weights `[9 · C, O]` and a bias `[O]`.
     pub(super) fn new(weights: &[f32], bias: &[f32], stride: usize) -> Self {
         Self {
-            places: PackedWeights::new(weights, bias),
+            outputs: bias.len(),
+            places: Some(PackedWeights::new(weights, bias)),
             patches: (stride == 1).then(|| PatchWeights::new(weights, bias)),
         }
     }
 
+    /// For images of one size only.
+    pub(super) fn of_image(weights: &[f32], bias: &[f32], image: ImageGeometry) -> Self {
+        let is_tiled = PatchWeights::fit(image, bias.len());
+        Self {
+            outputs: bias.len(),
+            places: (!is_tiled).then(|| PackedWeights::new(weights, bias)),
+            patches: is_tiled.then(|| PatchWeights::new(weights, bias)),
+        }
+    }
+
     pub(super) fn outputs(&self) -> usize {
-        self.places.outputs()
+        self.outputs
     }
 }
 
@@ -44,22 +56,26 @@ pub(super) enum Written<'a> {
 
 /// A convolution of images with a border of zeros.
 pub(super) struct BorderedConvolution<'a> {
-    packed: &'a PackedKernel,
     image: ImageGeometry,
-    runs: Vec<TapRun>,
-    /// Where the weights fit.
-    tiled: Option<TiledConvolution<'a>>,
+    form: Form<'a>,
+}
+
+/// How the sums are computed.
+enum Form<'a> {
+    Tiles(TiledConvolution<'a>),
+    Places(&'a PackedWeights, Vec<TapRun>),
 }
 
 impl<'a> BorderedConvolution<'a> {
     pub(super) fn new(packed: &'a PackedKernel, image: ImageGeometry) -> Self {
-        let patches = packed.patches.as_ref().filter(|patches| patches.fit(image));
-        Self {
-            tiled: patches.map(|patches| TiledConvolution::new(patches, image)),
-            packed,
-            image,
-            runs: image.runs().collect(),
-        }
+        let patches = packed.patches.as_ref();
+        let patches = patches.filter(|_| PatchWeights::fit(image, packed.outputs));
+        let places = || packed.places.as_ref().expect("weights of another image are a bug");
+        let form = match patches {
+            Some(patches) => Form::Tiles(TiledConvolution::new(patches, image)),
+            None => Form::Places(places(), image.runs().collect()),
+        };
+        Self { image, form }
     }
 
     /// Computes one item.
@@ -81,26 +97,26 @@ impl<'a> BorderedConvolution<'a> {
     }
 
     fn buffers(&self) -> [usize; 2] {
-        self.tiled.as_ref().map_or([0; 2], TiledConvolution::buffers)
-    }
-
-    fn convolve(&self, bordered: &[f32], buffers: [&mut [f32]; 2], out: &mut [f32], start: StartSums) {
-        match &self.tiled {
-            Some(tiled) => tiled.forward(bordered, buffers, out, start),
-            None => self.convolve_places(bordered, out, start),
+        match &self.form {
+            Form::Tiles(tiled) => tiled.buffers(),
+            Form::Places(..) => [0; 2],
         }
     }
 
-    fn convolve_places(&self, bordered: &[f32], out: &mut [f32], start: StartSums) {
+    fn convolve(&self, bordered: &[f32], buffers: [&mut [f32]; 2], out: &mut [f32], start: StartSums) {
         let ImageGeometry { channels, shape, .. } = self.image;
-        let row_length = self.image.out_width() * self.packed.places.outputs();
+        let (places, runs) = match &self.form {
+            Form::Tiles(tiled) => return tiled.forward(bordered, buffers, out, start),
+            Form::Places(places, runs) => (places, runs),
+        };
+        let row_length = self.image.out_width() * places.outputs();
         for (row, out) in out.chunks_exact_mut(row_length).enumerate() {
             let inputs = PlaceInputs {
                 values: &bordered[row * shape.stride * self.image.pitch() * channels..],
                 step: shape.stride * channels,
-                runs: &self.runs,
+                runs,
             };
-            self.packed.places.multiply(inputs, out, start);
+            places.multiply(inputs, out, start);
         }
     }
 

@@ -1,4 +1,5 @@
-//! Products with weights that are packed once, when a model is loaded, for prediction. A block of sums stays in registers while
+//! Products with packed weights: for prediction, they are packed once, when a model is loaded; training packs those of a convolution at
+//! each step. A block of sums stays in registers while
 //! the inputs and weights pass by, so nothing is copied and no product lies in memory: on one core with AVX-512 this is about
 //! twice as fast as general matrix products of the same small sizes.
 // A closure's vector instructions reach what is inlined into it, and only that.

@@ -10,7 +10,7 @@ thread_local! {
     static KEPT: Cell<[Vec<f32>; BUFFERS]> = const { Cell::new([const { Vec::new() }; BUFFERS]) };
 }
 
-/// Calls `run` with buffers of these lengths, which hold anything.
+/// Calls `run` with buffers of these lengths, whose contents are unspecified.
 pub(super) fn with_buffers<R>(lengths: [usize; BUFFERS], run: impl FnOnce([&mut [f32]; BUFFERS]) -> R) -> R {
     let mut kept = KEPT.take();
     for (buffer, length) in kept.iter_mut().zip(lengths) {
@@ -18,11 +18,12 @@ pub(super) fn with_buffers<R>(lengths: [usize; BUFFERS], run: impl FnOnce([&mut 
             buffer.resize(length, 0.0);
         }
     }
-    let mut rest = kept
-        .iter_mut()
-        .zip(lengths)
-        .map(|(buffer, length)| &mut buffer[..length]);
-    let result = run(std::array::from_fn(|_| rest.next().unwrap_or_default()));
+    let [first, second, third] = &mut kept;
+    let result = run([
+        &mut first[..lengths[0]],
+        &mut second[..lengths[1]],
+        &mut third[..lengths[2]],
+    ]);
     KEPT.set(kept);
     result
 }

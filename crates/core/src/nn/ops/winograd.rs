@@ -1,8 +1,8 @@
 //! 3×3 convolutions with fewer products: Winograd's minimal filtering F(2×2, 3×3) (Lavin & Gray 2016). Four outputs of a channel
 //! take 16 products with each input channel instead of 36.
 //!
-//! Outputs are computed in tiles of 2×2. A tile reads a patch of 4×4 places, whose values are turned into 16 other values by
-//! additions; each is multiplied with its own matrix of weights, and additions turn the 16 sums into the four outputs. With a dilation,
+//! Outputs are computed in tiles of 2×2. A tile reads a patch of 4×4 places, whose values are transformed into 16 other values by
+//! additions; each is multiplied with its own matrix of weights, and additions transform the 16 sums into the four outputs. With a dilation,
 //! the places of a tile are that far apart.
 // A closure's vector instructions reach what is inlined into it, and only that.
 #![allow(clippy::inline_always)]
@@ -16,10 +16,10 @@ use super::packed::{PackedWeights, StartSums, lanes};
 const PATCH: usize = 16;
 /// Tiles that are computed together, so that what lies between the steps stays in the processor's cache.
 const TILES_TOGETHER: usize = 16;
-/// Values between the planes of a buffer, so that the planes do not take turns in the same few lines of the cache.
-const APART: usize = 16;
+/// Values between the planes of a buffer, so that the planes do not map to the same sets of the cache.
+const PLANE_PADDING: usize = 16;
 
-/// The weights of a convolution without a stride, turned for patches.
+/// The transformed weights of a convolution without a stride.
 #[derive(Debug)]
 pub(super) struct PatchWeights {
     bias: Vec<f32>,
@@ -53,14 +53,14 @@ impl PatchWeights {
         for at in 0..tap_length {
             // G w Gᵀ of the kernel from one channel to another.
             let row = |row: usize| {
-                turned_taps(std::array::from_fn(|column| {
+                transformed_taps(std::array::from_fn(|column| {
                     weights[(3 * row + column) * tap_length + at]
                 }))
             };
             let rows = [0, 1, 2].map(row);
             for column in 0..4 {
-                let turned = turned_taps(rows.map(|row| row[column]));
-                for (row, value) in turned.into_iter().enumerate() {
+                let column_of_taps = transformed_taps(rows.map(|row| row[column]));
+                for (row, value) in column_of_taps.into_iter().enumerate() {
                     matrices[4 * row + column][at] = value;
                 }
             }
@@ -74,25 +74,25 @@ impl PatchWeights {
         }
     }
 
-    /// Whether an image consists of whole tiles, and its channels and the outputs fill vectors.
-    pub(super) fn fit(&self, image: ImageGeometry) -> bool {
+    /// Whether tiles serve for an image: it consists of whole ones, and its channels and the outputs fill vectors.
+    pub(super) fn fit(image: ImageGeometry, outputs: usize) -> bool {
         let (side, lanes) = (2 * image.shape.dilation, lanes());
         image.shape.stride == 1
             && image.height.is_multiple_of(side)
             && image.width.is_multiple_of(side)
             && image.channels >= lanes
-            && self.bias.len().is_multiple_of(lanes)
+            && outputs.is_multiple_of(lanes)
     }
 }
 
-/// G of three taps: what each multiplies.
-fn turned_taps([first, second, third]: [f32; 3]) -> [f32; 4] {
+/// The filter transform G of the three taps of a row or column.
+fn transformed_taps([first, second, third]: [f32; 3]) -> [f32; 4] {
     let ends = first + third;
     [first, 0.5 * (ends + second), 0.5 * (ends - second), third]
 }
 
 impl<'a> TiledConvolution<'a> {
-    /// For images that the weights [fit](PatchWeights::fit).
+    /// For images for which tiles [serve](PatchWeights::fit).
     pub(super) fn new(weights: &'a PatchWeights, image: ImageGeometry) -> Self {
         let (outputs, dilation) = (weights.bias.len(), image.shape.dilation);
         let firsts = |side: usize| {
@@ -115,8 +115,8 @@ impl<'a> TiledConvolution<'a> {
         [self.image.channels, self.weights.bias.len()].map(|channels| PATCH * plane(together, channels))
     }
 
-    /// Computes one image, which has a border of zeros, into `out` `[H, W, O]`. The buffers get planes, one for each value of a patch:
-    /// `[TILES_TOGETHER, C]` and `[TILES_TOGETHER, O]`.
+    /// Computes one image, which has a border of zeros, into `out` `[H, W, O]`. The buffers get planes, one for each value of a patch, of
+    /// the tiles that are computed together: `[tiles, C]` and `[tiles, O]`, each with a padding.
     pub(super) fn forward(
         &self,
         bordered: &[f32],
@@ -155,10 +155,10 @@ impl<'a> TiledConvolution<'a> {
 /// From one plane of a buffer to the next, in values.
 #[inline(always)]
 fn plane(tiles: usize, channels: usize) -> usize {
-    tiles * channels + APART
+    tiles * channels + PLANE_PADDING
 }
 
-/// Turns the patches of tiles.
+/// Transforms the patches of tiles.
 struct Patches<'a> {
     bordered: &'a [f32],
     image: ImageGeometry,
@@ -210,13 +210,13 @@ impl Patches<'_> {
             vector::<S>(self.bordered, from + 2 * right),
             vector::<S>(self.bordered, from + 3 * right),
         ];
-        turned_values(simd, values)
+        transformed_values(simd, values)
     }
 
     #[inline(always)]
     fn column<S: Simd>(&mut self, simd: S, values: [S::f32s; 4], to: usize, column: usize) {
         let plane = plane(self.tiles.len(), self.image.channels);
-        let [first, second, third, fourth] = turned_values(simd, values);
+        let [first, second, third, fourth] = transformed_values(simd, values);
         let to = to + column * plane;
         set_vector::<S>(self.planes, to, first);
         set_vector::<S>(self.planes, to + 4 * plane, second);
@@ -225,7 +225,7 @@ impl Patches<'_> {
     }
 }
 
-/// Turns the sums of tiles into outputs.
+/// Transforms the sums of tiles into outputs.
 struct Outputs<'a> {
     products: &'a [f32],
     image: ImageGeometry,
@@ -307,9 +307,9 @@ fn set_vector<S: Simd>(values: &mut [f32], from: usize, vector: S::f32s) {
     S::as_mut_simd_f32s(&mut values[from..from + S::F32_LANES]).0[0] = vector;
 }
 
-/// Bᵀ of four values.
+/// The data transform Bᵀ of four values.
 #[inline(always)]
-fn turned_values<S: Simd>(simd: S, [first, second, third, fourth]: [S::f32s; 4]) -> [S::f32s; 4] {
+fn transformed_values<S: Simd>(simd: S, [first, second, third, fourth]: [S::f32s; 4]) -> [S::f32s; 4] {
     [
         simd.sub_f32s(first, third),
         simd.add_f32s(second, third),
@@ -318,7 +318,7 @@ fn turned_values<S: Simd>(simd: S, [first, second, third, fourth]: [S::f32s; 4])
     ]
 }
 
-/// Aᵀ of four sums.
+/// The output transform Aᵀ of four sums.
 #[inline(always)]
 fn sums<S: Simd>(simd: S, [first, second, third, fourth]: [S::f32s; 4]) -> [S::f32s; 2] {
     [
@@ -358,7 +358,7 @@ mod tests {
                 bordered[image.inside() + row * image.pitch() * channels..][..values.len()].copy_from_slice(values);
             }
             let weights_of_patches = PatchWeights::new(&weights, &bias);
-            assert!(weights_of_patches.fit(image));
+            assert!(PatchWeights::fit(image, outputs));
             let tiled = TiledConvolution::new(&weights_of_patches, image);
             let held = values(height * width * outputs, 4);
             let mut out = held.clone();
@@ -376,15 +376,20 @@ mod tests {
                 assert!((found - expected).abs() < 2e-5, "{found} {expected}");
             }
         }
-        let weights = PatchWeights::new(&[0.0; TAPS * 16 * 16], &[0.0; 16]);
         let image = |height, channels, shape| ImageGeometry {
             height,
             width: 4,
             channels,
             shape,
         };
-        assert!(weights.fit(image(4, 16, ConvShape::PLAIN)));
-        assert!(!weights.fit(image(5, 16, ConvShape::PLAIN)) && !weights.fit(image(4, 3, ConvShape::PLAIN)));
-        assert!(!weights.fit(image(4, 16, ConvShape::HALVING)) && !weights.fit(image(4, 16, ConvShape::dilated(4))));
+        assert!(PatchWeights::fit(image(4, 16, ConvShape::PLAIN), 16));
+        assert!(
+            !PatchWeights::fit(image(5, 16, ConvShape::PLAIN), 16)
+                && !PatchWeights::fit(image(4, 0, ConvShape::PLAIN), 16)
+        );
+        assert!(
+            !PatchWeights::fit(image(4, 16, ConvShape::HALVING), 16)
+                && !PatchWeights::fit(image(4, 16, ConvShape::dilated(4)), 16)
+        );
     }
 }

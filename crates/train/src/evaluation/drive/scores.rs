@@ -30,7 +30,7 @@ pub struct DriverScores {
     pub arrived: DriveScore,
     /// Collisions of an episode.
     pub collisions: DriveScore,
-    /// Collisions of a kilometre: all collisions over all ways.
+    /// Collisions per kilometre: all collisions divided by the total distance.
     pub collisions_per_km: DriveScore,
     /// Collisions in which the robot did not drive forward.
     pub while_standing: DriveScore,
@@ -93,7 +93,7 @@ impl DriverScores {
         };
         let with_rate = |means: &[f64]| {
             let mut values = means.to_vec();
-            // Collisions over ways; a robot that never moved counts as if it had gone a millimetre.
+            // A robot that never moved counts as if it had gone a millimetre.
             values.extend(means.get(9).map(|way_m| 1000.0 * means[2] / way_m.max(0.001)));
             values
         };
