@@ -70,7 +70,12 @@ impl<'a> BorderedConvolution<'a> {
     pub(super) fn new(packed: &'a PackedKernel, image: ImageGeometry) -> Self {
         let patches = packed.patches.as_ref();
         let patches = patches.filter(|_| PatchWeights::fit(image, packed.outputs));
-        let places = || packed.places.as_ref().expect("weights of another image are a bug");
+        let places = || {
+            packed
+                .places
+                .as_ref()
+                .expect("a kernel packed for another image is a bug")
+        };
         let form = match patches {
             Some(patches) => Form::Tiles(TiledConvolution::new(patches, image)),
             None => Form::Places(places(), image.runs().collect()),
