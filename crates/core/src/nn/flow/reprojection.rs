@@ -82,38 +82,48 @@ impl Motion {
     }
 }
 
-/// A pixel's depth after the last correction, and the pixels of the old view around where it was seen with it.
+/// A pixel's depth after the last correction, and the pixels of the old view by which it was corrected last.
 struct Found {
     depth: f32,
     around: Neighbourhood,
 }
 
-/// Of several pixels: place before the turn, place before turn and drive, depth.
+/// Of several pixels.
+struct FoundTogether {
+    /// Place before the turn.
+    turned: [OfPlaces; 2],
+    /// Where the depth was looked up for the last correction.
+    corrected_at: [OfPlaces; 2],
+    /// Place before turn and drive.
+    room: [OfPlaces; 2],
+    depth: OfPlaces,
+}
+
 #[inline(always)]
-fn found_together(
-    viewer: Viewer,
-    size: ImageSize,
-    depths: &[f32],
-    motion: Motion,
-    rays: &[[f32; 3]],
-) -> [OfPlaces; PLACE_VALUES] {
+fn found_together(viewer: Viewer, size: ImageSize, depths: &[f32], motion: Motion, rays: &[[f32; 3]]) -> FoundTogether {
     let mut directions = [[0.0; SAMPLED_TOGETHER]; 3];
     for (at, &ray) in rays.iter().enumerate() {
         [directions[0][at], directions[1][at], directions[2][at]] = rotated(ray, motion.sin, motion.cos);
     }
     let turned = projected(viewer, &directions);
     let mut found = size.sample(depths, &turned);
+    let mut corrected_at = turned;
     for _ in 0..ROUNDS {
         let points = motion.points(&directions, &found);
-        let seen = size.sample(depths, &projected(viewer, &points));
+        corrected_at = projected(viewer, &points);
+        let seen = size.sample(depths, &corrected_at);
         for at in 0..SAMPLED_TOGETHER {
             let depth = viewer.depth([points[0][at], points[1][at], points[2][at]]);
             let factor = seen[at] / depth.max(MIN_DEPTH);
             found[at] *= factor.clamp(CORRECTION[0], CORRECTION[1]);
         }
     }
-    let [x, y] = projected(viewer, &motion.points(&directions, &found));
-    [turned[0], turned[1], x, y, found]
+    FoundTogether {
+        room: projected(viewer, &motion.points(&directions, &found)),
+        turned,
+        corrected_at,
+        depth: found,
+    }
 }
 
 /// The places of points.
@@ -164,9 +174,13 @@ impl FusedOperation<2> for Reprojection {
                     let outs = out.chunks_mut(SAMPLED_TOGETHER * PLACE_VALUES);
                     for (out, rays) in outs.zip(rays[context].chunks(SAMPLED_TOGETHER)) {
                         let found = found_together(viewer, self.size, depths, motion, rays);
+                        let FoundTogether {
+                            turned, room, depth, ..
+                        } = &found;
+                        let values = [&turned[0], &turned[1], &room[0], &room[1], depth];
                         for (at, out) in out.chunks_exact_mut(PLACE_VALUES).enumerate() {
-                            for (out, found) in out.iter_mut().zip(&found) {
-                                *out = found[at];
+                            for (out, value) in out.iter_mut().zip(values) {
+                                *out = value[at];
                             }
                         }
                     }
@@ -202,8 +216,8 @@ impl FusedOperation<2> for Reprojection {
                         let pixels = gradients.chunks_exact(PLACE_VALUES).zip(rays).enumerate();
                         for (at, (gradient, &ray)) in pixels {
                             let found = Found {
-                                depth: found[4][at],
-                                around: self.size.around(found[2][at], found[3][at]),
+                                depth: found.depth[at],
+                                around: self.size.around(found.corrected_at[0][at], found.corrected_at[1][at]),
                             };
                             let of_pixel = pixel_gradient(viewer, motion, ray, &found, gradient);
                             for (sum, part) in sums.iter_mut().zip(of_pixel.motion) {
