@@ -1,5 +1,5 @@
-//! Time of the shipped flow networks: a window, a step of a stream, 8 windows together, and rollouts of many plans. The cases take turns, and the
-//! least of each is printed, since other programs run too.
+//! Time of the shipped flow networks: a window, a step of a stream, 8 windows together, and rollouts of many plans. The cases take
+//! turns, and the least of each is printed, since other programs run too.
 //!
 //! `cargo bench --bench flow [-- ROUNDS MODEL...]`; with `taskset -c 0` and `RAYON_NUM_THREADS=1` before it, on one core.
 #![allow(clippy::unwrap_used, missing_docs)]

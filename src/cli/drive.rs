@@ -25,11 +25,13 @@ use foreframe_train::evaluation::figures::episode_animation::episode_gif;
 /// speed of each robot in the picture, and remembers none; places knows those of all robots. simulator plans with the simulator
 /// itself as the model: the upper limit.
 ///
-/// Goals can be reached on a straight line, but for the other robots. All drivers know where the goal is. The
-/// table has means over the episodes with 95 % bootstrap intervals; "per km" are all collisions divided by the total distance. Of the collisions,
-/// (standing) are those in which the robot stood or turned on the spot, (unseen) those with a robot that its camera had not shown in the
-/// two seconds before. Episodes run side by side on all cores. After Ctrl-C, the table is of
-/// the episodes that are finished, which are fewer for later drivers (column "episodes"), and no GIFs are drawn.
+/// Goals can be reached on a straight line, but for the other robots. All drivers know where the goal is. The table has means over
+/// the episodes with 95 % bootstrap intervals; "per km" is the number of all collisions divided by the total distance. Of the
+/// collisions, (standing) are those in which the robot stood or turned on the spot, (unseen) those with a robot that its camera had
+/// not shown in the two seconds before. Episodes run side by side on all cores.
+///
+/// After Ctrl-C, the table has the episodes that are finished. Drivers then have different numbers of episodes (column "episodes"),
+/// and no GIFs are drawn.
 ///
 /// With --out, writes drive.json (the scores and all episodes) and three GIFs for each driver: its best, its median and its worst
 /// episode, as in pid-best.gif. Those with a success come first, then those with fewer collisions, then the shorter ones. A GIF shows the

@@ -1,5 +1,5 @@
-//! What a pixel of a future frame shows: what the last frame shows too, what only an earlier frame shows, what no frame shows, or a robot. And
-//! the errors of each of these classes.
+//! What a pixel of a future frame shows: something that the last frame shows too, that only an earlier frame shows, that no frame
+//! shows, or a robot. And the errors in each of these classes.
 
 use serde::{Deserialize, Serialize};
 

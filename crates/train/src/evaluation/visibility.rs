@@ -18,8 +18,8 @@ const MAX_WINDOWS: usize = 200;
 /// Windows that are computed together.
 const BATCH: usize = 8;
 
-/// Classifies the pixels of some of the windows; nothing for a recording. `None` for a window that the simulator cannot replay. Errors: those of the
-/// network and the simulator, `Cancelled`, `Io`.
+/// Classifies the pixels of some of the windows; nothing for a recording. `None` for a window that the simulator cannot replay.
+/// Errors: those of the network and the simulator, `Cancelled`, `Io`.
 pub(super) fn measure(
     evaluation: &EvaluationContext,
     windows: &[Window],

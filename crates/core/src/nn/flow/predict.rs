@@ -1,8 +1,8 @@
 //! Predicts the rollouts of a batch with the flow network, in any of its forms, on all threads of the pool that it is called in.
 //!
 //! What depends only on the context is computed once for all rollouts that follow it. Without gradients, each step is then computed
-//! on its own (but in the recurrent form, where a step needs the one before), so that what lies between two layers stays in the processor's cache, many rollouts take no more memory than few, and
-//! a single one is computed by several threads too.
+//! on its own, so that what lies between two layers stays in the processor's cache, many rollouts take no more memory than few, and
+//! several threads compute a single one. In the recurrent form, steps follow each other.
 
 use std::ops::Range;
 
@@ -58,15 +58,6 @@ impl FlowNetwork {
         movers: Option<&Tensor>,
         predict: impl Fn(&StepsAhead) -> Result<PredictedAhead, NnError> + Sync,
     ) -> Result<FlowPrediction, NnError> {
-        let with_motion = |predicted: PredictedAhead, motion: Tensor| -> Result<FlowPrediction, NnError> {
-            let PredictedAhead { frames, scene, movers } = predicted;
-            Ok(FlowPrediction {
-                frames,
-                scene,
-                motion,
-                movers,
-            })
-        };
         let mut predicted = if self.is_trained() {
             let known = self.known_ahead(rows)?;
             // The scene's own loss is of all steps.
@@ -80,14 +71,14 @@ impl FlowNetwork {
                 frames: all.frames.narrow(1, 0, steps)?,
                 ..all
             };
-            with_motion(asked, known.motion)?
+            asked.with_motion(known.motion)
         } else {
             in_parts(rows, (0..rows.count()).map(|row| row..row + 1).collect(), |row| {
                 let known = self.known_ahead(row)?;
                 let each = (0..steps).into_par_iter();
                 let parts = each.map(|step| predict(&StepsAhead::new(row, step..step + 1, &known)));
                 let parts = parts.collect::<Result<Vec<_>, NnError>>()?;
-                with_motion(joined_steps(&parts)?, known.motion)
+                Ok(joined_steps(&parts)?.with_motion(known.motion))
             })?
         };
         if let (Some(seen), Some(coming)) = (movers, &predicted.movers) {
@@ -100,15 +91,21 @@ impl FlowNetwork {
 
 /// Steps of the same rollouts, one after another.
 fn joined_steps(parts: &[PredictedAhead]) -> Result<PredictedAhead, NnError> {
-    let joined = |of: fn(&PredictedAhead) -> Option<&Tensor>| {
-        let given: Vec<&Tensor> = parts.iter().filter_map(of).collect();
-        (!given.is_empty()).then(|| Tensor::cat(&given, 1)).transpose()
-    };
     Ok(PredictedAhead {
         frames: Tensor::cat(&parts.iter().map(|part| &part.frames).collect::<Vec<_>>(), 1)?,
-        scene: joined(|part| part.scene.as_ref())?,
-        movers: joined(|part| part.movers.as_ref())?,
+        scene: joined_if_given(parts, |part| part.scene.as_ref(), 1)?,
+        movers: joined_if_given(parts, |part| part.movers.as_ref(), 1)?,
     })
+}
+
+/// Tensors of all parts along an axis; `None` where the parts have none.
+fn joined_if_given<P>(
+    parts: &[P],
+    of: impl Fn(&P) -> Option<&Tensor>,
+    axis: usize,
+) -> candle_core::Result<Option<Tensor>> {
+    let given: Vec<&Tensor> = parts.iter().filter_map(of).collect();
+    (!given.is_empty()).then(|| Tensor::cat(&given, axis)).transpose()
 }
 
 /// The predictions of parts of the rollouts, joined.
@@ -123,14 +120,10 @@ fn in_parts(
     let parts = parts.par_drain(..).map(|part| predict(&rows.part(part)));
     let parts = parts.collect::<Result<Vec<FlowPrediction>, NnError>>()?;
     let joined = |of: fn(&FlowPrediction) -> &Tensor| Tensor::cat(&parts.iter().map(of).collect::<Vec<_>>(), 0);
-    let if_given = |of: fn(&FlowPrediction) -> Option<&Tensor>| {
-        let given: Vec<&Tensor> = parts.iter().filter_map(of).collect();
-        (!given.is_empty()).then(|| Tensor::cat(&given, 0)).transpose()
-    };
     Ok(FlowPrediction {
         frames: joined(|part| &part.frames)?,
-        scene: if_given(|part| part.scene.as_ref())?,
+        scene: joined_if_given(&parts, |part| part.scene.as_ref(), 0)?,
         motion: joined(|part| &part.motion)?,
-        movers: if_given(|part| part.movers.as_ref())?,
+        movers: joined_if_given(&parts, |part| part.movers.as_ref(), 0)?,
     })
 }

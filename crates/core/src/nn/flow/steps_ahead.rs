@@ -4,7 +4,7 @@ use std::ops::Range;
 
 use candle_core::Tensor;
 
-use super::network::FlowNetwork;
+use super::network::{FlowNetwork, FlowPrediction};
 use super::rollout_rows::RolloutRows;
 use crate::nn::error::NnError;
 use crate::nn::geometry::camera::CameraPose;
@@ -43,6 +43,18 @@ impl FlowNetwork {
             modulation: modulation.reshape((rows.count(), self.spec.horizon, ()))?,
             motion,
         })
+    }
+}
+
+impl PredictedAhead {
+    /// With how the camera will have moved at all steps, `[N, horizon, 3]`.
+    pub(super) fn with_motion(self, motion: Tensor) -> FlowPrediction {
+        FlowPrediction {
+            frames: self.frames,
+            scene: self.scene,
+            motion,
+            movers: self.movers,
+        }
     }
 }
 

@@ -1,7 +1,6 @@
-//! Products with packed weights: for prediction, they are packed once, when a model is loaded; training packs those of a convolution at
-//! each step. A block of sums stays in registers while
-//! the inputs and weights pass by, so nothing is copied and no product lies in memory: on one core with AVX-512 this is about
-//! twice as fast as general matrix products of the same small sizes.
+//! Products with packed weights. For prediction, weights are packed once, when a model is loaded. Training packs those of its convolutions
+//! in every pass. A block of sums stays in registers while the inputs and weights pass by, so nothing is copied and no product lies in
+//! memory. On one core with AVX-512, this is about twice as fast as general matrix products of the same small sizes.
 // A closure's vector instructions reach what is inlined into it, and only that.
 #![allow(clippy::inline_always)]
 

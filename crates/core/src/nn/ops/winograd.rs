@@ -2,8 +2,8 @@
 //! take 16 products with each input channel instead of 36.
 //!
 //! Outputs are computed in tiles of 2×2. A tile reads a patch of 4×4 places, whose values are transformed into 16 other values by
-//! additions; each is multiplied with its own matrix of weights, and additions transform the 16 sums into the four outputs. With a dilation,
-//! the places of a tile are that far apart.
+//! additions; each is multiplied with its own matrix of weights, and additions transform the 16 sums into the four outputs. With a dilation
+//! of d, the places of a tile and of its patch are d apart.
 // A closure's vector instructions reach what is inlined into it, and only that.
 #![allow(clippy::inline_always)]
 
@@ -74,7 +74,7 @@ impl PatchWeights {
         }
     }
 
-    /// Whether tiles serve for an image: it consists of whole ones, and its channels and the outputs fill vectors.
+    /// Whether tiles can be used for an image: it consists of whole ones, and its channels and the outputs fill vectors.
     pub(super) fn fit(image: ImageGeometry, outputs: usize) -> bool {
         let (side, lanes) = (2 * image.shape.dilation, lanes());
         image.shape.stride == 1
@@ -92,7 +92,7 @@ fn transformed_taps([first, second, third]: [f32; 3]) -> [f32; 4] {
 }
 
 impl<'a> TiledConvolution<'a> {
-    /// For images for which tiles [serve](PatchWeights::fit).
+    /// For an image that [fits](PatchWeights::fit).
     pub(super) fn new(weights: &'a PatchWeights, image: ImageGeometry) -> Self {
         let (outputs, dilation) = (weights.bias.len(), image.shape.dilation);
         let firsts = |side: usize| {
