@@ -12,6 +12,8 @@ use serde::{Deserialize, Serialize};
 use crate::server::{ServerConfig, SettingError};
 use crate::telemetry::LogFormat;
 use foreframe_core::error_kind::{ErrorKind, HasErrorKind};
+use foreframe_core::nn::NnError;
+use foreframe_core::nn::device;
 use foreframe_train::settings::{LayeredSettings, SettingsError, SettingsLayer};
 
 /// The file that is read if it exists and no other is named.
@@ -191,6 +193,13 @@ impl LoadedConfig {
         Err(ConfigError::Value(sentence))
     }
 
+    /// Makes the networks of this process compute on the configured device. Errors: `Value`.
+    pub fn choose_device(&self) -> Result<(), ConfigError> {
+        let origin = self.values.origin("device");
+        let refused = |error: NnError| ConfigError::Value(format!("{error} ({origin})"));
+        device::choose(self.config.server.device).map_err(refused)
+    }
+
     /// The settings as TOML, each with its meaning and origin; passwords in URLs are hidden.
     #[must_use]
     pub fn to_toml(&self) -> String {
@@ -235,6 +244,7 @@ fn expected(field: &str) -> Option<String> {
     let what = match field {
         "bind" => "HOST:PORT, as in 127.0.0.1:8642 or localhost:8642",
         "admin_bind" => "HOST:PORT, as in 127.0.0.1:8643, or off",
+        "device" => "cpu, cuda or cuda:N",
         "port" => "0 to 65535",
         _ => return range(field),
     };

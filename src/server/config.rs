@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
+use foreframe_core::nn::device::DeviceName;
 use foreframe_core::nn::spec::MAX_STEPS;
 use foreframe_core::serving::PredictorConfig;
 use foreframe_data::dataset::import::{DEFAULT_DISK_MIB, DEFAULT_MAX_FILES};
@@ -72,6 +73,10 @@ settings! {
     /// The directory of the models that were not published by a job of this server.
     #[schema(value_type = String)]
     models_dir: PathBuf = PathBuf::from("models");
+    /// Where networks compute, in predictions and trainings: `cpu`, or `cuda` or `cuda:N` for an NVIDIA graphics card, which needs
+    /// the Cargo feature `cuda`.
+    #[schema(value_type = String)]
+    device: DeviceName = DeviceName::Cpu;
     /// `sqlite:FILE` or `postgres://…`. Default: a file in the data directory.
     database_url: Option<String> = None;
     /// How long a starting server or worker waits for its PostgreSQL, in seconds.
@@ -269,6 +274,7 @@ impl ServerConfig {
     #[must_use]
     pub fn job_resources(&self) -> JobResources {
         JobResources {
+            device: self.device,
             threads: self.job_threads,
             memory: JobMemory {
                 limit_mib: self.job_memory_mib,

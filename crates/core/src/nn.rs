@@ -16,6 +16,7 @@
 mod conditioning;
 pub mod costs;
 pub mod dense;
+pub mod device;
 pub mod error;
 pub mod flow;
 mod fused;
@@ -31,6 +32,9 @@ pub mod network;
 mod ops;
 mod options;
 pub mod parameters;
+mod plain;
+#[cfg(test)]
+mod plain_agreement;
 pub mod spec;
 pub mod ssim_loss;
 pub mod tensors;

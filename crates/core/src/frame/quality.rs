@@ -6,8 +6,8 @@ use super::preprocess::{convolve_separable, convolve_separable_adjoint, gaussian
 const SSIM_RADIUS_PX: usize = 5;
 const SSIM_SIGMA_PX: f32 = 1.5;
 /// (K1 · L)² and (K2 · L)² with K1 = 0.01, K2 = 0.03, L = 1 (Wang et al. 2004).
-const SSIM_C1: f32 = 0.01 * 0.01;
-const SSIM_C2: f32 = 0.03 * 0.03;
+pub(crate) const SSIM_C1: f32 = 0.01 * 0.01;
+pub(crate) const SSIM_C2: f32 = 0.03 * 0.03;
 
 /// Side of the even window of scikit-image.
 const EVEN_WINDOW_PX: usize = 7;
@@ -69,6 +69,11 @@ fn even_means(values: &[f64], width: usize) -> Vec<f64> {
         .collect()
 }
 
+/// The shares of the pixels along one side of the window, from its first to its last.
+pub(crate) fn ssim_kernel() -> Vec<f32> {
+    gaussian_kernel(SSIM_SIGMA_PX, SSIM_RADIUS_PX)
+}
+
 /// What the structural similarity of two images is made of at each pixel.
 pub struct SsimTerms<'a> {
     images: [&'a [f32]; 2],
@@ -83,7 +88,7 @@ impl<'a> SsimTerms<'a> {
     /// The terms of two images of this width and of equal size.
     #[must_use]
     pub fn new(a: &'a [f32], b: &'a [f32], width: usize) -> Self {
-        let kernel = gaussian_kernel(SSIM_SIGMA_PX, SSIM_RADIUS_PX);
+        let kernel = ssim_kernel();
         let local_mean = |values: &[f32]| convolve_separable(values, width, &kernel);
         let product = |p: &[f32], q: &[f32]| p.iter().zip(q).map(|(p, q)| p * q).collect::<Vec<f32>>();
         let means = [local_mean(a), local_mean(b)];

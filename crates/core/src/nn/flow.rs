@@ -28,6 +28,7 @@ mod motion;
 mod mover_head;
 mod network;
 mod occupancy;
+mod plain;
 mod predict;
 mod recurrent;
 mod reprojection;

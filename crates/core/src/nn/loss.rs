@@ -12,6 +12,7 @@ use serde::{Deserialize, Serialize};
 use super::error::NnError;
 use super::fused::{FusedOperation, Operand, apply};
 use super::options::named_enum;
+use super::plain::losses;
 use crate::vectorized::vectorized;
 
 named_enum!(
@@ -28,6 +29,13 @@ impl Loss {
     /// The loss as a scalar tensor. Only `prediction` gets a gradient. Errors: `Shape` if the shapes differ.
     pub fn between(self, prediction: &Tensor, target: &Tensor) -> Result<Tensor, NnError> {
         check_same_shape(prediction, target)?;
+        if !prediction.device().is_cpu() {
+            let target = target.to_device(prediction.device())?.detach();
+            return Ok(match self {
+                Self::Mse => losses::squared(prediction, &target)?,
+                Self::L1 => losses::absolute(prediction, &target)?,
+            });
+        }
         Ok(apply(self, [prediction, &target.detach()])?)
     }
 }

@@ -6,11 +6,16 @@ use candle_core::{Shape, Tensor};
 use super::error::NnError;
 use super::fused::{FusedOperation, Operand, apply};
 use super::loss::check_same_shape;
+use super::plain::losses;
 
 /// The binary cross entropy of logits and a mask of 0 and 1, mean over all pixels, as a scalar tensor. Only `logits` gets a
 /// gradient. Errors: `Shape` if the shapes differ.
 pub fn mask_loss(logits: &Tensor, mask: &Tensor) -> Result<Tensor, NnError> {
     check_same_shape(logits, mask)?;
+    if !logits.device().is_cpu() {
+        let mask = mask.to_device(logits.device())?.detach();
+        return Ok(losses::cross_entropy(logits, &mask)?);
+    }
     Ok(apply(MaskLoss, [logits, &mask.detach()])?)
 }
 

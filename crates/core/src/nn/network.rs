@@ -6,6 +6,7 @@ use candle_core::{DType, Device, Tensor, Var};
 
 use super::conditioning::ConditioningTensors;
 use super::dense::{DenseNetwork, Feedback};
+use super::device;
 use super::error::NnError;
 use super::flow::{FlowNetwork, FlowPrediction, Occupancy};
 use super::geometry::state_channels::StateChannels;
@@ -43,15 +44,27 @@ impl Network {
 
     /// As [`Network::new`], without gradients for tensors whose name starts with one of the prefixes.
     pub fn with_frozen(spec: ModelSpec, parameters: &Parameters, frozen: &[&str]) -> Result<Self, NnError> {
+        Self::build(spec, parameters, frozen, false)
+    }
+
+    /// As [`Network::with_frozen`], in plain tensor operations on the CPU too, to compare both.
+    #[cfg(test)]
+    pub(crate) fn plain(spec: ModelSpec, parameters: &Parameters, frozen: &[&str]) -> Result<Self, NnError> {
+        Self::build(spec, parameters, frozen, true)
+    }
+
+    /// The network with its weights on the program's device; the parameters stay on the CPU, and their gradients come back to it.
+    fn build(spec: ModelSpec, parameters: &Parameters, frozen: &[&str], always_plain: bool) -> Result<Self, NnError> {
         spec.validate()?;
+        let device = device::current();
         let mut tensors = BTreeMap::new();
         for (name, shape) in spec.tensor_shapes() {
             let tensor = of_shape(&name, &shape, parameters.get(&name).map(Var::as_tensor))?;
             let is_frozen = frozen.iter().any(|prefix| name.starts_with(prefix));
             let tensor = if is_frozen { tensor.detach() } else { tensor.clone() };
-            tensors.insert(name, tensor);
+            tensors.insert(name, tensor.to_device(&device)?);
         }
-        let tensors = ModelTensors(tensors);
+        let tensors = ModelTensors { tensors, always_plain };
         let network = match spec.architecture {
             Architecture::Dense(sizes) => AnyNetwork::Dense(Box::new(DenseNetwork::new(spec.clone(), sizes, &tensors))),
             Architecture::Flow(sizes) => AnyNetwork::Flow(Box::new(FlowNetwork::new(spec.clone(), sizes, &tensors))),
@@ -195,7 +208,7 @@ impl Network {
             AnyNetwork::Flow(flow) => flow.wheels(),
         };
         let wheels = match learned {
-            Some(wheels) => wheels.clone(),
+            Some(wheels) => wheels.to_device(&Device::Cpu)?,
             None => Tensor::zeros(2, DType::F32, &Device::Cpu)?,
         };
         let motions = wheel_dynamics::integral(&wheels, speeds, self.spec.frame_period_s)?;

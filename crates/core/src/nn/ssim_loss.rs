@@ -9,12 +9,17 @@ use rayon::prelude::*;
 use super::error::NnError;
 use super::fused::{FusedOperation, Operand, apply};
 use super::loss::check_same_shape;
+use super::plain::losses;
 use crate::frame::quality::SsimTerms;
 
 /// 1 minus the mean structural similarity of the frames `[…, P]`, as a scalar; `width` is a row's length in pixels.
 /// Only `prediction` gets a gradient. Errors: `Shape` if the shapes differ.
 pub fn ssim_loss(prediction: &Tensor, target: &Tensor, width: usize) -> std::result::Result<Tensor, NnError> {
     check_same_shape(prediction, target)?;
+    if !prediction.device().is_cpu() {
+        let target = target.to_device(prediction.device())?.detach();
+        return Ok(losses::dissimilarity(prediction, &target, width)?);
+    }
     let frame = prediction.dims().last().copied().unwrap_or(0);
     Ok(apply(SsimLoss { frame, width }, [prediction, &target.detach()])?)
 }

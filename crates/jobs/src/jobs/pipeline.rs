@@ -28,6 +28,7 @@ use super::{EvaluateSpec, Job, JobError, JobSpec, JobState, TrainSpec, datasets}
 use crate::store::{JobId, Store, StoreError};
 use crate::versions::Versions;
 use foreframe_core::error_text;
+use foreframe_core::nn::device::DeviceName;
 use foreframe_core::types::{DatasetName, ModelName};
 use foreframe_data::dataset::{Dataset, DatasetInfo};
 use foreframe_train::evaluation;
@@ -36,6 +37,8 @@ use foreframe_train::training::{self, CHECKPOINT_FILE, Training, TrainingEvent};
 /// What a job can use.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct JobResources {
+    /// Where its networks compute.
+    pub device: DeviceName,
     /// How many threads it uses.
     pub threads: usize,
     /// Its memory: trainings that need more are refused, and no more of a data set's frames are held.

@@ -1,10 +1,9 @@
 //! The dense network: encodes frames to features and decodes them, predicts the next frames, reconstructs the context.
 
-use candle_core::Tensor;
-use candle_nn::Module as _;
+use candle_core::{Device, Tensor};
 
-use super::lstm::unroll;
-use super::lstm_cell::{Decoder, LstmState, PeepholeCell};
+use super::layer_form::LayerForm;
+use super::lstm_cell::{Decoder, DecoderInputs, LstmState, PeepholeCell};
 use crate::nn::conditioning::ConditioningTensors;
 use crate::nn::error::NnError;
 use crate::nn::model_tensors::ModelTensors;
@@ -34,6 +33,7 @@ pub(in crate::nn) struct DenseNetwork {
     predictor_output: Linear,
     reconstructor: PeepholeCell,
     reconstructor_output: Linear,
+    layers: LayerForm,
 }
 
 impl DenseNetwork {
@@ -56,6 +56,7 @@ impl DenseNetwork {
             predictor_output: tensors.linear("predictor.output"),
             reconstructor: cell("reconstructor"),
             reconstructor_output: tensors.linear("reconstructor.output"),
+            layers: LayerForm::of(tensors),
             spec,
             sizes,
         }
@@ -72,12 +73,12 @@ impl DenseNetwork {
 
     /// Encodes frames `[N, P]` in the model's value range to features `[N, F]`.
     pub(in crate::nn) fn encode_frames(&self, frames: &Tensor) -> Result<Tensor, NnError> {
-        Ok(self.frame_encoder.forward(frames)?)
+        self.finished(self.layers.linear(&self.frame_encoder, &self.moved(frames)?)?)
     }
 
     /// Decodes features `[N, F]` to frames `[N, P]` in the model's value range, not clamped.
     pub(in crate::nn) fn decode_frames(&self, features: &Tensor) -> Result<Tensor, NnError> {
-        Ok(self.frame_decoder.forward(features)?)
+        self.finished(self.layers.linear(&self.frame_decoder, &self.moved(features)?)?)
     }
 
     /// Predicts the features `[B, horizon, F]` of the frames that follow the context `features` `[B, context, F]`, from the
@@ -90,7 +91,8 @@ impl DenseNetwork {
         condition: &ConditioningTensors,
         target: &Tensor,
     ) -> Result<Tensor, NnError> {
-        let conditions = condition.inputs(&self.spec, features.dim(0)?)?;
+        let (features, target) = (&self.moved(features)?, self.moved(target)?);
+        let conditions = self.conditions(condition, features.dim(0)?)?;
         let (_, state) = self.encode(features)?;
         let last = features.get_on_dim(1, self.spec.context - 1)?.contiguous()?;
         let previous = Tensor::cat(&[&last.unsqueeze(1)?, &target.narrow(1, 0, self.spec.horizon - 1)?], 1)?;
@@ -98,8 +100,8 @@ impl DenseNetwork {
             Some(conditions) => Tensor::cat(&[&previous, conditions], 2)?,
             None => previous.clone(),
         };
-        let (outputs, _) = unroll(&self.predictor, &inputs, &state)?;
-        let outputs = Self::each_step(&self.predictor_output, &outputs)?;
+        let (outputs, _) = self.layers.unroll(&self.predictor, &inputs, &state)?;
+        let outputs = self.each_step(&self.predictor_output, &outputs)?;
         Ok(match self.sizes.predictor_output {
             PredictorOutput::Residual => (previous + outputs)?,
             PredictorOutput::Absolute => outputs,
@@ -115,11 +117,12 @@ impl DenseNetwork {
         windows: &[u32],
         condition: &ConditioningTensors,
     ) -> Result<Tensor, NnError> {
+        let features = &self.moved(features)?;
         let (_, LstmState { h, c }) = self.encode(features)?;
         let last = features.get_on_dim(1, self.spec.context - 1)?;
         let rows = Tensor::new(windows, features.device())?;
         let of_rollouts = |values: &Tensor| values.contiguous()?.index_select(&rows, 0);
-        let conditions = condition.inputs(&self.spec, windows.len())?;
+        let conditions = self.conditions(condition, windows.len())?;
         let decoder = Decoder {
             cell: &self.predictor,
             output: &self.predictor_output,
@@ -129,15 +132,22 @@ impl DenseNetwork {
             h: of_rollouts(&h)?,
             c: of_rollouts(&c)?,
         };
-        decoder.run(self.spec.horizon, &of_rollouts(&last)?, conditions.as_ref(), &state)
+        let first = of_rollouts(&last)?;
+        let inputs = DecoderInputs {
+            steps: self.spec.horizon,
+            first: &first,
+            conditions: conditions.as_ref(),
+        };
+        self.finished(self.layers.decode(&decoder, inputs, &state)?)
     }
 
     /// Reconstructs the features `[B, context, F]` from the encoder's output. Approach 1 (sequence): the decoder starts from
     /// the encoder's last state; its first input is zero, then it gets its own output. Approach 2 (stepwise): after each
     /// frame, the decoder gets the encoder's output at that frame.
     pub(in crate::nn) fn reconstruct(&self, features: &Tensor) -> Result<Tensor, NnError> {
+        let features = &self.moved(features)?;
         let (outputs, state) = self.encode(features)?;
-        match self.sizes.reconstruction {
+        let reconstructed = match self.sizes.reconstruction {
             Reconstruction::Sequence => {
                 let decoder = Decoder {
                     cell: &self.reconstructor,
@@ -145,24 +155,51 @@ impl DenseNetwork {
                     residual: false,
                 };
                 let first = features.get_on_dim(1, 0)?.zeros_like()?.contiguous()?;
-                decoder.run(self.spec.context, &first, None, &state)
+                let inputs = DecoderInputs {
+                    steps: self.spec.context,
+                    first: &first,
+                    conditions: None,
+                };
+                self.layers.decode(&decoder, inputs, &state)?
             }
             Reconstruction::Stepwise => {
                 let start = self.reconstructor.zero_state(features.dim(0)?)?;
-                let (outputs, _) = unroll(&self.reconstructor, &outputs, &start)?;
-                Self::each_step(&self.reconstructor_output, &outputs)
+                let (outputs, _) = self.layers.unroll(&self.reconstructor, &outputs, &start)?;
+                self.each_step(&self.reconstructor_output, &outputs)?
             }
-        }
+        };
+        self.finished(reconstructed)
     }
 
     /// A layer at each step of `[B, T, …]`.
-    fn each_step(layer: &Linear, x: &Tensor) -> Result<Tensor, NnError> {
+    fn each_step(&self, layer: &Linear, x: &Tensor) -> Result<Tensor, NnError> {
         let (batch, steps, _) = x.dims3()?;
-        Ok(layer.forward(&x.flatten(0, 1)?)?.reshape((batch, steps, ()))?)
+        let outputs = self.layers.linear(layer, &x.flatten(0, 1)?)?;
+        Ok(outputs.reshape((batch, steps, ()))?)
+    }
+
+    /// The scaled actions and states of each step, on the network's device.
+    fn conditions(&self, condition: &ConditioningTensors, batch: usize) -> Result<Option<Tensor>, NnError> {
+        let inputs = condition.inputs(&self.spec, batch)?;
+        inputs.map(|inputs| self.moved(&inputs)).transpose()
+    }
+
+    /// A tensor on the network's device.
+    fn moved(&self, tensor: &Tensor) -> Result<Tensor, NnError> {
+        Ok(tensor.to_device(self.frame_decoder.weight.device())?)
+    }
+
+    /// A result: without gradients, on the CPU.
+    fn finished(&self, tensor: Tensor) -> Result<Tensor, NnError> {
+        if tensor.track_op() {
+            return Ok(tensor);
+        }
+        Ok(tensor.to_device(&Device::Cpu)?)
     }
 
     /// The encoder's outputs `[B, context, H]` and its last state.
     fn encode(&self, features: &Tensor) -> Result<(Tensor, LstmState), NnError> {
-        unroll(&self.encoder, features, &self.encoder.zero_state(features.dim(0)?)?)
+        let start = self.encoder.zero_state(features.dim(0)?)?;
+        self.layers.unroll(&self.encoder, features, &start)
     }
 }

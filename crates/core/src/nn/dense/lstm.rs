@@ -3,7 +3,7 @@
 use candle_core::Tensor;
 use candle_nn::Module as _;
 
-use super::lstm_cell::{Decoder, LstmState, PeepholeCell};
+use super::lstm_cell::{Decoder, DecoderInputs, LstmState, PeepholeCell};
 use super::recurrence::{FeedbackLoop, Recurrence};
 use crate::nn::error::NnError;
 use crate::nn::ops::linear::Linear;
@@ -33,14 +33,13 @@ fn input_projection(cell: &PeepholeCell, x: &Tensor, first_row: usize) -> Result
 }
 
 impl Decoder<'_> {
-    /// Features `[B, steps, F]` that follow `first` `[B, F]`. Step k also gets `conditions` `[B, steps, A + S]` at k.
-    pub(super) fn run(
-        &self,
-        steps: usize,
-        first: &Tensor,
-        conditions: Option<&Tensor>,
-        state: &LstmState,
-    ) -> Result<Tensor, NnError> {
+    /// The features `[B, steps, F]` of all steps.
+    pub(super) fn run(&self, inputs: DecoderInputs, state: &LstmState) -> Result<Tensor, NnError> {
+        let DecoderInputs {
+            steps,
+            first,
+            conditions,
+        } = inputs;
         let Self { cell, output, residual } = *self;
         let projection = match conditions {
             Some(conditions) => input_projection(cell, conditions, first.dim(1)?)?,

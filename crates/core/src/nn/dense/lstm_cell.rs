@@ -64,3 +64,14 @@ pub(super) struct Decoder<'a> {
     /// Whether the output is added to the previous features, instead of replacing them.
     pub(super) residual: bool,
 }
+
+/// What a decoder starts from, beside the cell's state.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct DecoderInputs<'a> {
+    /// Steps to decode.
+    pub(super) steps: usize,
+    /// The features before the first step, `[B, F]`.
+    pub(super) first: &'a Tensor,
+    /// What each step also gets, `[B, steps, A + S]`.
+    pub(super) conditions: Option<&'a Tensor>,
+}

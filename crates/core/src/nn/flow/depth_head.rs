@@ -22,19 +22,19 @@ pub(super) const MIXED_VALUES: usize = KNOWN_VALUES + 1;
 /// outside the last frame it is.
 pub(super) const FINE_VALUES: usize = KNOWN_VALUES + 2;
 /// Largest logarithm of the estimated depth over the one before anything is learned.
-const MAX_LOGARITHM: f64 = 1.5;
+pub(super) const MAX_LOGARITHM: f64 = 1.5;
 /// Pixels outside the frame that count as 1.
-const OUTSIDE_PX: f32 = 8.0;
+pub(super) const OUTSIDE_PX: f32 = 8.0;
 /// The most that counts of them.
-const MAX_OUTSIDE: f32 = 4.0;
+pub(super) const MAX_OUTSIDE: f32 = 4.0;
 /// Least depth whose inverse the fine layers read, in metres.
-const LEAST_DEPTH_M: f32 = 0.05;
+pub(super) const LEAST_DEPTH_M: f32 = 0.05;
 
 /// The layers that estimate depth.
 #[derive(Clone, Debug)]
 pub(super) struct DepthHead {
-    enlarge: Linear,
-    output: Convolution3,
+    pub(super) enlarge: Linear,
+    pub(super) output: Convolution3,
 }
 
 impl DepthHead {

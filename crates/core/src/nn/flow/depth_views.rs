@@ -14,15 +14,15 @@ use crate::nn::ops::sampling::ImageSize;
 use crate::vectorized::vectorized;
 
 /// Distance of everything that the floor does not explain, before anything is learned.
-const WALL_M: f32 = 2.2;
+pub(super) const WALL_M: f32 = 2.2;
 /// The change of depth whose shift the encoder reads.
-const FARTHER: f32 = 1.25;
+pub(super) const FARTHER: f32 = 1.25;
 /// Pixels of shift that count as 1.
-const SHIFT_PX: f32 = 4.0;
+pub(super) const SHIFT_PX: f32 = 4.0;
 /// The most that counts of them: what is behind the camera would shift without end.
-const MAX_SHIFT: f32 = 4.0;
+pub(super) const MAX_SHIFT: f32 = 4.0;
 /// Smallest spread of a frame's intensities.
-const MIN_SPREAD: f32 = 0.04;
+pub(super) const MIN_SPREAD: f32 = 0.04;
 /// What is known of a 2×2 block: column, row, inverse of the depth before anything is learned.
 pub(super) const KNOWN_VALUES: usize = 3;
 

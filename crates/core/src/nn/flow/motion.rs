@@ -19,17 +19,17 @@ pub(super) const MOTION_HIDDEN: usize = 64;
 /// The tensor of what was learned of the wheels.
 pub(super) const WHEELS: &str = "flow.motion.drive";
 /// Radians or metres that one unit of the correction stands for.
-const CORRECTION: f64 = 0.1;
+pub(super) const CORRECTION: f64 = 0.1;
 /// Pixels that one unit of the affine map moves the frame's corner, as a share of its side.
-const AFFINE: f64 = 0.25;
+pub(super) const AFFINE: f64 = 0.25;
 
 /// The learned part.
 #[derive(Clone, Debug)]
 pub(super) struct MotionHead {
-    layers: Option<[Linear; 2]>,
+    pub(super) layers: Option<[Linear; 2]>,
     /// What was learned of the wheels; `None` where no speeds are commanded.
-    wheels: Option<Tensor>,
-    affine: Option<Linear>,
+    pub(super) wheels: Option<Tensor>,
+    pub(super) affine: Option<Linear>,
 }
 
 impl MotionHead {
@@ -68,17 +68,22 @@ impl MotionHead {
         let Some(layers) = &self.layers else {
             return Ok(Tensor::zeros(shape, DType::F32, &Device::Cpu)?);
         };
+        let correction = perceptron(layers, &rows.scaled()?)?;
+        Ok((self.integral(rows)? + (correction.reshape(shape)? * CORRECTION)?)?)
+    }
+
+    /// The motion of a base that follows its commands `[N, horizon, 3]`, on the CPU.
+    pub(super) fn integral(&self, rows: &RolloutRows) -> Result<Tensor, NnError> {
+        let spec = rows.spec;
         let channels = StateChannels::of(spec);
         let speeds = (0..rows.count())
             .map(|row| channels.speeds(rows.state(row), rows.actions(row), spec.actions.len()))
             .collect();
         let wheels = match &self.wheels {
-            Some(wheels) => wheels.clone(),
+            Some(wheels) => wheels.to_device(&Device::Cpu)?,
             None => Tensor::zeros(2, DType::F32, &Device::Cpu)?,
         };
-        let plain = wheel_dynamics::integral(&wheels, speeds, spec.frame_period_s)?;
-        let correction = perceptron(layers, &rows.scaled()?)?;
-        Ok((plain + (correction.reshape(shape)? * CORRECTION)?)?)
+        Ok(wheel_dynamics::integral(&wheels, speeds, spec.frame_period_s)?)
     }
 
     /// Where each pixel was, `[M, P, 2]`, by a learned affine map of the image; `None` for a standing camera. `own` is each

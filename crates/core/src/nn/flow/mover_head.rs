@@ -11,8 +11,8 @@ use crate::nn::ops::pixel_shuffle::pixel_shuffle;
 /// The layers that tell where movers are, as logits of each pixel.
 #[derive(Clone, Debug)]
 pub(super) struct MoverHead {
-    seen: Linear,
-    coming: Linear,
+    pub(super) seen: Linear,
+    pub(super) coming: Linear,
 }
 
 impl MoverHead {

@@ -45,20 +45,22 @@ pub(super) enum Surroundings {
 /// The network. Holds weights only.
 #[derive(Clone, Debug)]
 pub(in crate::nn) struct FlowNetwork {
+    /// Whether it computes in plain tensor operations: on another device than the CPU, and in tests.
+    pub(super) is_plain: bool,
     pub(super) spec: ModelSpec,
     pub(super) sizes: FlowSpec,
-    stem: Convolution3,
-    halving: Convolution3,
-    blocks: Vec<[Convolution3; 2]>,
+    pub(super) stem: Convolution3,
+    pub(super) halving: Convolution3,
+    pub(super) blocks: Vec<[Convolution3; 2]>,
     pub(super) surroundings: Surroundings,
     pub(super) motion: MotionHead,
     pub(super) movers: Option<MoverHead>,
-    modulation: [Linear; 2],
+    pub(super) modulation: [Linear; 2],
     pub(super) mix: Linear,
-    refine: Vec<[Convolution3; 2]>,
-    enlarge: Linear,
-    fine: Convolution3,
-    head: Convolution3,
+    pub(super) refine: Vec<[Convolution3; 2]>,
+    pub(super) enlarge: Linear,
+    pub(super) fine: Convolution3,
+    pub(super) head: Convolution3,
 }
 
 impl FlowNetwork {
@@ -94,6 +96,7 @@ impl FlowNetwork {
             enlarge: tensors.linear("flow.enlarge"),
             fine: convolution("fine", ConvShape::PLAIN),
             head: convolution("head", ConvShape::PLAIN),
+            is_plain: tensors.are_plain(),
             spec,
         }
     }
@@ -104,7 +107,11 @@ impl FlowNetwork {
     }
 
     /// Packs the weights of all layers as they are now, for fast prediction.
+    /// Those of plain tensor operations stay as they are.
     pub(in crate::nn) fn pack(&mut self) -> Result<(), NnError> {
+        if self.is_plain {
+            return Ok(());
+        }
         let convolutions = [&mut self.stem, &mut self.halving, &mut self.fine, &mut self.head].into_iter();
         let blocks = self.blocks.iter_mut().chain(&mut self.refine).flatten();
         for convolution in convolutions.chain(blocks) {

@@ -26,6 +26,9 @@ impl FlowNetwork {
         steps: usize,
     ) -> Result<FlowPrediction, NnError> {
         let rows = RolloutRows::new(&self.spec, frames, windows, conditioning)?;
+        if self.is_plain {
+            return self.predict_plainly(&rows, steps);
+        }
         if self.is_trained() {
             return self.predict_rows(&rows, steps);
         }
@@ -119,11 +122,18 @@ fn in_parts(
     }
     let parts = parts.par_drain(..).map(|part| predict(&rows.part(part)));
     let parts = parts.collect::<Result<Vec<FlowPrediction>, NnError>>()?;
-    let joined = |of: fn(&FlowPrediction) -> &Tensor| Tensor::cat(&parts.iter().map(of).collect::<Vec<_>>(), 0);
-    Ok(FlowPrediction {
-        frames: joined(|part| &part.frames)?,
-        scene: joined_if_given(&parts, |part| part.scene.as_ref(), 0)?,
-        motion: joined(|part| &part.motion)?,
-        movers: joined_if_given(&parts, |part| part.movers.as_ref(), 0)?,
-    })
+    FlowPrediction::joined(&parts)
+}
+
+impl FlowPrediction {
+    /// The predictions of parts of the rollouts, one after another.
+    pub(super) fn joined(parts: &[Self]) -> Result<Self, NnError> {
+        let joined = |of: fn(&Self) -> &Tensor| Tensor::cat(&parts.iter().map(of).collect::<Vec<_>>(), 0);
+        Ok(Self {
+            frames: joined(|part| &part.frames)?,
+            scene: joined_if_given(parts, |part| part.scene.as_ref(), 0)?,
+            motion: joined(|part| &part.motion)?,
+            movers: joined_if_given(parts, |part| part.movers.as_ref(), 0)?,
+        })
+    }
 }

@@ -16,12 +16,12 @@ use crate::vectorized::vectorized;
 /// Values of a pixel: its place before the turn, its place before turn and drive (columns and rows), its depth in metres.
 pub(super) const PLACE_VALUES: usize = 5;
 /// Corrections of a pixel's depth.
-const ROUNDS: usize = 3;
+pub(super) const ROUNDS: usize = 3;
 /// Smallest and largest factor of one correction.
-const CORRECTION: [f32; 2] = [0.5, 2.0];
+pub(super) const CORRECTION: [f32; 2] = [0.5, 2.0];
 
 /// Least change of a pixel's depth in the old view with its depth in the new one, in gradients.
-const MIN_DEEPENING: f32 = 0.2;
+pub(super) const MIN_DEEPENING: f32 = 0.2;
 
 /// The places `[M, P, PLACE_VALUES]` of items that follow contexts with these `depths` `[contexts, P]`, after the camera's
 /// `motions` `[M, 3]` (yaw, ahead, left). Gradients go to both.

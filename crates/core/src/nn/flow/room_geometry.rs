@@ -14,19 +14,19 @@ use crate::nn::tensors::with_values;
 use crate::vectorized::vectorized;
 
 /// Octaves of sines and cosines of each coordinate of the point met.
-const OCTAVES: usize = 5;
+pub(super) const OCTAVES: usize = 5;
 /// The lowest frequency, in radians per unit of the room.
-const LOWEST: f32 = std::f32::consts::FRAC_PI_4;
+pub(super) const LOWEST: f32 = std::f32::consts::FRAC_PI_4;
 const WAVES: usize = 3 * 2 * OCTAVES;
-const SIDES: usize = 6;
+pub(super) const SIDES: usize = 6;
 /// Numbers that describe one ray: waves, side met, point met, the ray itself and the distance.
 pub(super) const RAY_VALUES: usize = WAVES + SIDES + 12;
 /// Where the sides lie before they are learned, from the middle of the places seen in training, in units of the room.
-const FIRST_SIDES: [f32; SIDES] = [-2.6, 2.6, -2.6, 2.6, -0.8, 2.0];
+pub(super) const FIRST_SIDES: [f32; SIDES] = [-2.6, 2.6, -2.6, 2.6, -0.8, 2.0];
 /// Units of the room that one unit of the learned parameter moves a side.
-const SIDE_GAIN: f32 = 2.0;
+pub(super) const SIDE_GAIN: f32 = 2.0;
 /// Nearest that a side counts.
-const MIN_DISTANCE: f32 = 0.02;
+pub(super) const MIN_DISTANCE: f32 = 0.02;
 
 /// The unit of a room and its origin: typical places of the robot in training.
 #[derive(Clone, Copy, Debug, PartialEq)]

@@ -24,9 +24,9 @@ use crate::nn::tensors::with_values;
 
 /// Octaves of sines and cosines of a block's column and row.
 const OCTAVES: usize = 4;
-const PLACE_VALUES: usize = 2 * 2 * OCTAVES + 2;
+pub(super) const PLACE_VALUES: usize = 2 * 2 * OCTAVES + 2;
 /// Added to the content, so that an untrained scene is middle gray.
-const MIDDLE_GRAY: f64 = 0.5;
+pub(super) const MIDDLE_GRAY: f64 = 0.5;
 
 /// How the surroundings are described.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -78,11 +78,11 @@ impl SceneKind {
 /// The learned function.
 #[derive(Clone, Debug)]
 pub(super) struct Scene {
-    kind: SceneKind,
+    pub(super) kind: SceneKind,
     /// Three linear layers with `SiLU` between them; none for an image.
-    layers: Vec<Linear>,
+    pub(super) layers: Vec<Linear>,
     /// The room's sides `[6]`; else one value per block and channel `[H/2 · W/2, SCENE_CHANNELS]`.
-    learned: Tensor,
+    pub(super) learned: Tensor,
 }
 
 /// From where a scene is seen.
@@ -204,7 +204,7 @@ impl Scene {
 }
 
 /// Sines, cosines and values of each block's column and row, `[H/2 · W/2, PLACE_VALUES]`.
-fn place_values(half: ImageSize) -> Vec<f32> {
+pub(super) fn place_values(half: ImageSize) -> Vec<f32> {
     let mut values = Vec::with_capacity(half.pixels() * PLACE_VALUES);
     for row in 0..half.height {
         for column in 0..half.width {

@@ -17,12 +17,12 @@ pub(in crate::nn) const SCENE_FEATURES: usize = 8;
 /// Channels of the scene on the grid of half the sides: features, then the content of each 2×2 block.
 pub(in crate::nn) const SCENE_CHANNELS: usize = SCENE_FEATURES + 4;
 /// Pixels that a flow of 1 moves.
-const FLOW_PX: f32 = 4.0;
+pub(in crate::nn) const FLOW_PX: f32 = 4.0;
 /// How much the room's pixels are preferred before anything is learned, as a logit.
-const ROOM_LOGIT: f32 = 1.5;
+pub(in crate::nn) const ROOM_LOGIT: f32 = 1.5;
 /// Logit lost with each pixel that a place lies outside the frame, and the most that is lost.
-const OUTSIDE_LOGIT: f32 = 2.0;
-const MAX_OUTSIDE_LOGIT: f32 = 8.0;
+pub(in crate::nn) const OUTSIDE_LOGIT: f32 = 2.0;
+pub(in crate::nn) const MAX_OUTSIDE_LOGIT: f32 = 8.0;
 
 /// What a frame is composed from, beside the tensors.
 #[derive(Clone)]

@@ -1,0 +1,120 @@
+//! The form that estimates depth, as [`super::super::depth`] says.
+
+use candle_core::{Result, Tensor};
+
+use super::Ahead;
+use super::cameras::Cameras;
+use super::composition::moved_blocks;
+use super::depth_views::SeenViews;
+use super::reprojection::{Reprojected, reproject};
+use crate::frame::warp::CameraModel;
+use crate::nn::error::NnError;
+use crate::nn::flow::depth_head::{DepthHead, LEAST_DEPTH_M, MAX_LOGARITHM, MAX_OUTSIDE, OUTSIDE_PX};
+use crate::nn::flow::network::{FlowNetwork, FlowPrediction};
+use crate::nn::flow::rollout_rows::RolloutRows;
+use crate::nn::ops::linear::Linear;
+use crate::nn::ops::sampling::ImageSize;
+use crate::nn::plain::convolution::convolution;
+use crate::nn::plain::layers::{linear_per_place, pixel_shuffle};
+use crate::nn::plain::sampling::{at_least, at_most, sample_features};
+
+impl FlowNetwork {
+    pub(super) fn predict_with_depth_plainly(
+        &self,
+        rows: &RolloutRows,
+        head: &DepthHead,
+        steps: usize,
+    ) -> std::result::Result<FlowPrediction, NnError> {
+        let size = self.spec.image_size();
+        let contexts = rows.contexts(self.sizes.layers.frames_read);
+        let views = SeenViews::of(&contexts, self.device())?;
+        let features = self.encode_plainly(&views.inputs)?;
+        let depths = (head.depth_factors(&features)? * &views.depths)?;
+        let [coarse, _] = features;
+        let ahead = self.ahead(rows, steps)?;
+
+        let cameras: Vec<CameraModel> = (ahead.context_of.iter())
+            .map(|&context| views.cameras[context as usize])
+            .collect();
+        let cameras = Cameras::new(&cameras, size, self.device())?;
+        let seen = reproject(&cameras, size, &ahead.of_contexts(&depths)?, &ahead.item_motion)?;
+        let known = ahead.of_contexts(&views.known)?;
+        let coarse_places = seen.places.room.detach().coarse(size)?;
+        let quarter = size.shrunk(4);
+        let is_seen = coarse_places.inside(quarter, 0.5)?;
+        let mixed = Tensor::cat(
+            &[
+                sample_features(&ahead.of_contexts(&coarse)?, &coarse_places)?,
+                corners(&known, size.shrunk(2))?,
+                is_seen.reshape((is_seen.dim(0)?, 1, quarter.height, quarter.width))?,
+            ],
+            1,
+        )?;
+        let state = self.state_plainly(&mixed, &ahead.modulation)?;
+
+        let last = ahead.of_contexts(&views.frames)?;
+        let moved = moved_blocks(&last, size, &seen.places.room)?;
+        let head = self.head_plainly(&state, &moved, &beside_pixels(&known, &seen, size)?)?;
+        let frames = seen.places.compose(&last, size, &head, &last.zeros_like()?)?;
+        let frames = frames
+            .broadcast_mul(&ahead.of_contexts(&views.spread)?)?
+            .broadcast_add(&ahead.of_contexts(&views.mean)?)?;
+        Ok(FlowPrediction {
+            frames: ahead.in_rows(&frames)?,
+            scene: None,
+            movers: self.movers_plainly(&coarse, &state, &ahead)?,
+            motion: ahead.motion,
+        })
+    }
+
+    /// Where movers are in the last frame and in the steps of each rollout, as logits `[N, 1 + steps, P]`; `None` if the model does not
+    /// tell.
+    fn movers_plainly(
+        &self,
+        coarse: &Tensor,
+        state: &Tensor,
+        ahead: &Ahead,
+    ) -> std::result::Result<Option<Tensor>, NnError> {
+        let Some(layers) = &self.movers else { return Ok(None) };
+        let [_, steps] = ahead.shape;
+        let seen = ahead.in_rows(&ahead.of_contexts(&logits(&layers.seen, coarse)?)?)?;
+        let coming = ahead.in_rows(&logits(&layers.coming, state)?)?;
+        debug_assert_eq!(coming.dim(1)?, steps);
+        Ok(Some(Tensor::cat(&[&seen.narrow(1, 0, 1)?, &coming], 1)?))
+    }
+}
+
+impl DepthHead {
+    /// The depth of each pixel of the last frames `[contexts, P]`, over that before anything is learned.
+    fn depth_factors(&self, [coarse, first]: &[Tensor; 2]) -> Result<Tensor> {
+        let enlarged = pixel_shuffle(&linear_per_place(&self.enlarge, &coarse.silu()?)?)?.silu()?;
+        let logarithm = convolution(&self.output, &Tensor::cat(&[&enlarged, first], 1)?)?;
+        let logarithm = pixel_shuffle(&logarithm)?.flatten_from(1)?;
+        (logarithm.tanh()? * MAX_LOGARITHM)?.exp()
+    }
+}
+
+/// The logits of movers `[…, P]` from features on the grid of a quarter of the sides.
+fn logits(layer: &Linear, features: &Tensor) -> Result<Tensor> {
+    let blocks = linear_per_place(layer, &features.silu()?)?;
+    pixel_shuffle(&pixel_shuffle(&blocks)?)?.flatten_from(1)
+}
+
+/// What the fine layers read beside the moved pixels, `[M, FINE_VALUES, H/2, W/2]`: of each block's upper left pixel.
+fn beside_pixels(known: &Tensor, seen: &Reprojected, size: ImageSize) -> Result<Tensor> {
+    let image = |values: &Tensor| values.reshape((values.dim(0)?, 1, size.height, size.width));
+    let inverse = at_least(&seen.depths, LEAST_DEPTH_M.into())?.recip()?;
+    let outside = (seen.places.room.detach().outside(size)? * (1.0 / f64::from(OUTSIDE_PX)))?;
+    let outside = at_most(&outside, MAX_OUTSIDE.into())?;
+    let of_blocks = |values: &Tensor| corners(&image(values)?, size);
+    Tensor::cat(&[known, &of_blocks(&inverse)?, &of_blocks(&outside)?], 1)
+}
+
+/// The upper left of each four places of images of that size: half the sides.
+fn corners(images: &Tensor, size: ImageSize) -> Result<Tensor> {
+    let (items, channels, _, _) = images.dims4()?;
+    let half = size.shrunk(2);
+    let blocks = images.reshape(&[items, channels, half.height, 2, half.width, 2][..])?;
+    let upper_left = blocks.narrow(3, 0, 1)?.narrow(5, 0, 1)?;
+    upper_left.reshape((items, channels, half.height, half.width))
+}

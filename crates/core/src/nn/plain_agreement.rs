@@ -1,0 +1,233 @@
+//! Both networks in plain tensor operations against the fused operations: predictions, and gradients of a loss.
+
+use candle_core::{DType, Device, Tensor};
+
+use super::conditioning::ConditioningTensors;
+use super::dense::Feedback;
+use super::flow::FlowPrediction;
+use super::gradient_check::{noise, values};
+use super::network::Network;
+use super::options::{Conditioning, PredictorOutput, Reconstruction};
+use super::parameters::Parameters;
+use super::spec::{Architecture, ChannelScale, DenseSpec, FlowLayers, FlowSpec, ModelSpec};
+use crate::frame::warp::CameraModel;
+use crate::types::Seed;
+
+const SIDES: [usize; 2] = [16, 24];
+const WINDOWS: usize = 3;
+
+fn channel(name: &str, unit: &str, std: f32) -> ChannelScale {
+    ChannelScale {
+        name: name.to_owned(),
+        unit: unit.to_owned(),
+        mean: 0.1,
+        std,
+    }
+}
+
+fn spec(architecture: Architecture, conditioning: Conditioning) -> ModelSpec {
+    ModelSpec {
+        architecture,
+        frame_width_px: SIDES[1] as u32,
+        frame_height_px: SIDES[0] as u32,
+        context: 4,
+        horizon: 3,
+        conditioning,
+        actions: vec![channel("linear", "m/s", 0.5), channel("angular", "rad/s", 0.9)],
+        states: vec![
+            channel("x", "m", 1.1),
+            channel("y", "m", 0.9),
+            channel("heading_cos", "", 0.7),
+            channel("heading_sin", "", 0.7),
+            channel("speed", "m/s", 0.4),
+            channel("turn", "rad/s", 0.8),
+        ],
+        ..ModelSpec::default()
+    }
+}
+
+fn flow(layers: FlowLayers, camera: Option<CameraModel>) -> Architecture {
+    let layers = FlowLayers {
+        channels: 8,
+        stem_channels: 6,
+        encoder_blocks: 2,
+        enlarged_channels: 5,
+        fine_channels: 7,
+        scene_hidden: 9,
+        frames_read: 3,
+        ..layers
+    };
+    Architecture::Flow(FlowSpec { layers, camera })
+}
+
+/// Weights of which none are zero.
+fn parameters(spec: &ModelSpec) -> Parameters {
+    let parameters = Parameters::initialize(spec, Seed(3)).unwrap();
+    for (index, (name, var)) in parameters.iter().enumerate() {
+        let share = if name.ends_with("weight") { 0.05 } else { 0.02 };
+        let changed = (var.as_tensor() + (noise(var.dims(), index as u64) * share).unwrap()).unwrap();
+        var.set(&changed).unwrap();
+    }
+    parameters
+}
+
+/// Pictures with edges and slopes, 0 to 1.
+fn frames(context: usize) -> Tensor {
+    let [height, width] = SIDES;
+    let mut pixels = Vec::new();
+    for frame in 0..WINDOWS * context {
+        for pixel in 0..height * width {
+            let (x, y, t) = ((pixel % width) as f32, (pixel / width) as f32, frame as f32);
+            let wave = 0.5 + 0.3 * (0.4 * x + 0.3 * t).sin() * (0.5 * y - 0.2 * t).cos();
+            pixels.push(wave.clamp(0.0, 1.0));
+        }
+    }
+    Tensor::from_vec(pixels, (WINDOWS, context, height * width), &Device::Cpu).unwrap()
+}
+
+fn conditioning(spec: &ModelSpec) -> ConditioningTensors {
+    let scaled = |shape: &[usize], seed| (noise(shape, seed) * 0.4).unwrap();
+    let states = spec.states.len();
+    ConditioningTensors {
+        actions: Some(scaled(&[WINDOWS, spec.horizon, spec.actions.len()], 11)),
+        state: Some(scaled(&[WINDOWS, states], 12)),
+        past_states: Some(scaled(&[WINDOWS, spec.context - 1, states], 13)),
+        cameras: Vec::new(),
+    }
+}
+
+fn largest_difference(a: &Tensor, b: &Tensor) -> f32 {
+    assert_eq!(a.dims(), b.dims());
+    let pairs = values(a).into_iter().zip(values(b));
+    pairs.map(|(a, b)| (a - b).abs()).fold(0.0, |most, difference| {
+        assert!(difference.is_finite());
+        most.max(difference)
+    })
+}
+
+/// All that a network gives, one after another.
+fn outputs(predicted: &FlowPrediction) -> Vec<Tensor> {
+    let given = [
+        Some(&predicted.frames),
+        predicted.scene.as_ref(),
+        Some(&predicted.motion),
+        predicted.movers.as_ref(),
+    ];
+    given.into_iter().flatten().cloned().collect()
+}
+
+/// Checks predictions, and the gradients of a weighted sum of all outputs.
+fn assert_agreement(spec: &ModelSpec, predict: impl Fn(&Network) -> Vec<Tensor>) {
+    let parameters = parameters(spec);
+    let detached = [
+        Network::detached(spec.clone(), &parameters).unwrap(),
+        Network::plain(spec.clone(), &parameters, &[""]).unwrap(),
+    ];
+    let [fused, plain] = detached.each_ref().map(&predict);
+    for (index, (fused, plain)) in fused.iter().zip(&plain).enumerate() {
+        let difference = largest_difference(fused, plain);
+        assert!(difference < 1e-5, "output {index}: {difference}");
+    }
+    let trained = [
+        Network::new(spec.clone(), &parameters).unwrap(),
+        Network::plain(spec.clone(), &parameters, &[]).unwrap(),
+    ];
+    let [fused, plain] = trained.each_ref().map(|network| {
+        let outputs = predict(network);
+        let weighted = outputs.iter().enumerate().map(|(index, output)| {
+            let weights = noise(output.dims(), 50 + index as u64);
+            (output * weights).unwrap().sum_all().unwrap()
+        });
+        let loss = weighted.reduce(|sum, part| (sum + part).unwrap()).unwrap();
+        loss.backward().unwrap()
+    });
+    for (name, var) in parameters.iter() {
+        let of = |gradients: &candle_core::backprop::GradStore| {
+            let none = || Tensor::zeros(var.dims(), DType::F32, &Device::Cpu).unwrap();
+            gradients.get(var).cloned().unwrap_or_else(none)
+        };
+        let (fused, plain) = (of(&fused), of(&plain));
+        let largest = values(&fused)
+            .into_iter()
+            .fold(0.0f32, |most, value| most.max(value.abs()));
+        let difference = largest_difference(&fused, &plain);
+        assert!(
+            difference <= 1e-3 * largest.max(1e-2),
+            "{name}: {difference} of {largest}"
+        );
+    }
+}
+
+fn assert_flow_agrees(layers: FlowLayers, camera: Option<CameraModel>, conditions: Conditioning) {
+    let spec = spec(flow(layers, camera), conditions);
+    assert_agreement(&spec, |network| {
+        let predicted = network.predict_flow(&frames(spec.context), &conditioning(&spec), spec.horizon);
+        outputs(&predicted.unwrap().unwrap())
+    });
+}
+
+fn camera() -> Option<CameraModel> {
+    Some(CameraModel {
+        height_m: Some(0.4),
+        ..CameraModel::new(1.1, 0.25).unwrap()
+    })
+}
+
+#[test]
+fn the_form_that_estimates_depth_agrees() {
+    let layers = FlowLayers {
+        depth: true,
+        movers: true,
+        ..FlowLayers::default()
+    };
+    assert_flow_agrees(layers, camera(), Conditioning::StateAction);
+    assert_flow_agrees(layers, None, Conditioning::Action);
+}
+
+#[test]
+fn the_form_with_a_learned_room_agrees() {
+    assert_flow_agrees(FlowLayers::default(), camera(), Conditioning::StateAction);
+}
+
+#[test]
+fn the_form_without_a_camera_agrees() {
+    assert_flow_agrees(FlowLayers::default(), None, Conditioning::StateAction);
+    assert_flow_agrees(FlowLayers::default(), camera(), Conditioning::Action);
+}
+
+#[test]
+fn the_form_of_a_standing_camera_agrees() {
+    assert_flow_agrees(FlowLayers::default(), None, Conditioning::None);
+}
+
+#[test]
+fn the_dense_network_agrees() {
+    for (reconstruction, predictor_output) in [
+        (Reconstruction::Sequence, PredictorOutput::Residual),
+        (Reconstruction::Stepwise, PredictorOutput::Absolute),
+    ] {
+        let sizes = DenseSpec {
+            features: 12,
+            hidden: 10,
+            reconstruction,
+            predictor_output,
+            ..DenseSpec::default()
+        };
+        let spec = spec(Architecture::Dense(sizes), Conditioning::StateAction);
+        assert_agreement(&spec, |network| {
+            let frames = frames(spec.context);
+            let pixels = frames.flatten(0, 1).unwrap();
+            let codes = network.encode_frames(&pixels).unwrap();
+            let codes = codes.reshape((WINDOWS, spec.context, ())).unwrap();
+            let truth = codes.narrow(1, 0, spec.horizon).unwrap().contiguous().unwrap();
+            let condition = conditioning(&spec);
+            let feedbacks = [Feedback::Prediction, Feedback::TeacherForcing(&truth)];
+            let mut outputs = feedbacks
+                .map(|feedback| network.predict(&codes, &condition, feedback).unwrap())
+                .to_vec();
+            outputs.push(network.reconstruct(&codes).unwrap().unwrap());
+            outputs.push(network.decode_frames(&outputs[0].flatten(0, 1).unwrap()).unwrap());
+            outputs
+        });
+    }
+}
