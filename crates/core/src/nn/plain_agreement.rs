@@ -4,7 +4,7 @@ use candle_core::{DType, Device, Tensor};
 
 use super::conditioning::ConditioningTensors;
 use super::dense::Feedback;
-use super::flow::FlowPrediction;
+use super::flow::{FlowPrediction, Occupancy};
 use super::gradient_check::{noise, values};
 use super::network::Network;
 use super::options::{Conditioning, PredictorOutput, Reconstruction};
@@ -166,6 +166,39 @@ fn assert_flow_agrees(layers: FlowLayers, camera: Option<CameraModel>, condition
     });
 }
 
+/// What stands around the robot in each window, as numbers.
+fn assert_occupancy_agrees(layers: FlowLayers) {
+    let spec = spec(flow(layers, camera()), Conditioning::StateAction);
+    let parameters = parameters(&spec);
+    let networks = [
+        Network::detached(spec.clone(), &parameters).unwrap(),
+        Network::plain(spec.clone(), &parameters, &[""]).unwrap(),
+    ];
+    let [fused, plain] = networks.map(|network| {
+        let found = network.occupancy(&frames(spec.context), &conditioning(&spec));
+        found.unwrap().unwrap()
+    });
+    for (fused, plain) in fused.iter().zip(&plain) {
+        assert!(!fused.points.is_empty());
+        assert_eq!(fused.points.len(), plain.points.len());
+        assert_eq!(
+            fused.movers.iter().map(Vec::len).collect::<Vec<_>>(),
+            plain.movers.iter().map(Vec::len).collect::<Vec<_>>()
+        );
+        let numbers = |seen: &Occupancy| {
+            let movers = seen.movers.iter().flatten().flatten();
+            let all = movers
+                .chain(seen.points.as_flattened())
+                .chain(&seen.depths_m)
+                .chain(&seen.first_depths_m);
+            all.copied().collect::<Vec<f32>>()
+        };
+        for (fused, plain) in numbers(fused).iter().zip(numbers(plain)) {
+            assert!((fused - plain).abs() < 1e-4, "{fused} {plain}");
+        }
+    }
+}
+
 fn camera() -> Option<CameraModel> {
     Some(CameraModel {
         height_m: Some(0.4),
@@ -182,6 +215,7 @@ fn the_form_that_estimates_depth_agrees() {
     };
     assert_flow_agrees(layers, camera(), Conditioning::StateAction);
     assert_flow_agrees(layers, None, Conditioning::Action);
+    assert_occupancy_agrees(layers);
 }
 
 #[test]

@@ -15,6 +15,7 @@ use super::steps_ahead::{PredictedAhead, StepsAhead};
 use crate::frame::warp::CameraModel;
 use crate::nn::conditioning::ConditioningTensors;
 use crate::nn::error::NnError;
+use crate::nn::geometry::camera::Viewer;
 use crate::nn::ops::compose::{Composition, RoomPlaces};
 use crate::nn::ops::linear::per_place;
 use crate::nn::ops::sampling::sample_features;
@@ -41,6 +42,24 @@ struct SeenAhead {
     state: Tensor,
 }
 
+/// What the network sees around the robot at the last frame of one rollout.
+pub(super) struct SeenAround {
+    /// Of each pixel, in metres.
+    pub(super) depths_m: Vec<f32>,
+    /// The same before anything is learned.
+    pub(super) first_depths_m: Vec<f32>,
+    /// `None` if the model does not find movers.
+    pub(super) movers: Option<SeenMovers>,
+}
+
+/// Where movers are.
+pub(super) struct SeenMovers {
+    /// Logits of the pixels of the last frame, then of each predicted one.
+    pub(super) logits: Vec<f32>,
+    /// Yaw, ahead and left of the camera at each predicted frame.
+    pub(super) motions: Vec<f32>,
+}
+
 impl FlowNetwork {
     /// What stands around the robot at the last frames of B windows `[B, context, P]`, and where movers will be under each
     /// window's actions; `None` if this form estimates no depth. Errors: `Shape`, `Missing`.
@@ -64,45 +83,61 @@ impl FlowNetwork {
     /// Of one rollout.
     fn occupancy_of(&self, row: &RolloutRows, head: &DepthHead) -> Result<Occupancy, NnError> {
         let size = self.spec.image_size();
-        let depths = self.see_depth(row, head)?;
         let camera = row.camera(0).unwrap_or(CameraModel::USUAL);
         let view = OccupancyView {
-            viewer: depths.views.viewers[0],
+            viewer: Viewer::new(camera, size),
             size,
             height_m: camera.height_m.unwrap_or(CameraModel::USUAL_HEIGHT_M),
         };
-        let known = Occupancy {
-            depths_m: depths.depths.flatten_all()?.to_vec1::<f32>()?,
-            first_depths_m: depths.views.depths.clone(),
-            ..Occupancy::default()
+        let SeenAround {
+            depths_m,
+            first_depths_m,
+            movers,
+        } = if self.is_plain {
+            self.look_around_plainly(row, head)?
+        } else {
+            self.look_around(row, head)?
         };
-        let Some((layers, seen)) = self.movers.as_ref().zip(depths.movers.as_ref()) else {
-            return Ok(Occupancy {
-                points: view.points(&known.depths_m, None),
-                ..known
-            });
-        };
-        let ahead = self.known_ahead(row)?;
-        let each = (0..self.spec.horizon).into_par_iter().map(|step| {
-            let seen = self.see_ahead(&StepsAhead::new(row, step..step + 1, &ahead), &depths)?;
-            layers.coming(&seen.state)
-        });
-        let coming = Tensor::cat(&each.collect::<Result<Vec<_>, NnError>>()?, 0)?;
-        let motions = ahead.motion.flatten_all()?.to_vec1::<f32>()?;
-        let logits = Tensor::cat(&[seen, &coming], 0)?;
-        Ok(with_values(&logits, |logits| {
-            let motions = std::iter::once([0.0; 3]).chain(motions.as_chunks::<3>().0.iter().copied());
-            let frames = logits.chunks_exact(size.pixels());
-            let movers = frames.zip(motions).enumerate().map(|(step, (logits, motion))| {
-                let depths = (step == 0).then_some(known.depths_m.as_slice());
-                view.movers(logits, motion, depths)
-            });
-            Occupancy {
-                movers: movers.collect(),
-                points: view.points(&known.depths_m, logits.get(..size.pixels())),
-                ..known
+        let logits = movers.as_ref().map(|movers| &movers.logits[..size.pixels()]);
+        Ok(Occupancy {
+            points: view.points(&depths_m, logits),
+            movers: movers.map_or_else(Vec::new, |movers| {
+                let motions = movers.motions.as_chunks::<3>().0.iter().copied();
+                let motions = std::iter::once([0.0; 3]).chain(motions);
+                let frames = movers.logits.chunks_exact(size.pixels());
+                let places = frames.zip(motions).enumerate().map(|(step, (logits, motion))| {
+                    let depths = (step == 0).then_some(depths_m.as_slice());
+                    view.movers(logits, motion, depths)
+                });
+                places.collect()
+            }),
+            depths_m,
+            first_depths_m,
+        })
+    }
+
+    fn look_around(&self, row: &RolloutRows, head: &DepthHead) -> Result<SeenAround, NnError> {
+        let depths = self.see_depth(row, head)?;
+        let movers = match self.movers.as_ref().zip(depths.movers.as_ref()) {
+            None => None,
+            Some((layers, seen)) => {
+                let ahead = self.known_ahead(row)?;
+                let each = (0..self.spec.horizon).into_par_iter().map(|step| {
+                    let seen = self.see_ahead(&StepsAhead::new(row, step..step + 1, &ahead), &depths)?;
+                    layers.coming(&seen.state)
+                });
+                let coming = Tensor::cat(&each.collect::<Result<Vec<_>, NnError>>()?, 0)?;
+                Some(SeenMovers {
+                    logits: Tensor::cat(&[seen, &coming], 0)?.flatten_all()?.to_vec1()?,
+                    motions: ahead.motion.flatten_all()?.to_vec1()?,
+                })
             }
-        })?)
+        };
+        Ok(SeenAround {
+            depths_m: depths.depths.flatten_all()?.to_vec1()?,
+            first_depths_m: depths.views.depths,
+            movers,
+        })
     }
 
     /// Encodes the contexts of the rollouts and estimates their depths.

@@ -1,6 +1,6 @@
 //! The form that estimates depth, as [`super::super::depth`] says.
 
-use candle_core::{Result, Tensor};
+use candle_core::Tensor;
 
 use super::Ahead;
 use super::cameras::Cameras;
@@ -9,6 +9,7 @@ use super::depth_views::SeenViews;
 use super::reprojection::{Reprojected, reproject};
 use crate::frame::warp::CameraModel;
 use crate::nn::error::NnError;
+use crate::nn::flow::depth::{SeenAround, SeenMovers};
 use crate::nn::flow::depth_head::{DepthHead, LEAST_DEPTH_M, MAX_LOGARITHM, MAX_OUTSIDE, OUTSIDE_PX};
 use crate::nn::flow::network::{FlowNetwork, FlowPrediction};
 use crate::nn::flow::rollout_rows::RolloutRows;
@@ -18,13 +19,71 @@ use crate::nn::plain::convolution::convolution;
 use crate::nn::plain::layers::{linear_per_place, pixel_shuffle};
 use crate::nn::plain::sampling::{at_least, at_most, sample_features};
 
+/// What the network sees of contexts, and of their rollouts' steps before the frames are composed.
+struct SeenSteps {
+    views: SeenViews,
+    /// The encoder's features of the contexts.
+    coarse: Tensor,
+    /// Of each pixel of the contexts' last frames `[contexts, P]`, in metres.
+    depths: Tensor,
+    ahead: Ahead,
+    /// Where the items' pixels were.
+    seen: Reprojected,
+    /// Column, row and inverse depth of each 2×2 block of the items.
+    known: Tensor,
+    /// The items' states.
+    state: Tensor,
+}
+
 impl FlowNetwork {
     pub(super) fn predict_with_depth_plainly(
         &self,
         rows: &RolloutRows,
         head: &DepthHead,
         steps: usize,
-    ) -> std::result::Result<FlowPrediction, NnError> {
+    ) -> Result<FlowPrediction, NnError> {
+        let size = self.spec.image_size();
+        let steps = self.see_steps(rows, head, steps)?;
+        let SeenSteps { views, ahead, seen, .. } = &steps;
+        let last = ahead.of_contexts(&views.frames)?;
+        let moved = moved_blocks(&last, size, &seen.places.room)?;
+        let beside = beside_pixels(&steps.known, seen, size)?;
+        let head = self.head_plainly(&steps.state, &moved, &beside)?;
+        let frames = seen.places.compose(&last, size, &head, &last.zeros_like()?)?;
+        let frames = frames
+            .broadcast_mul(&ahead.of_contexts(&views.spread)?)?
+            .broadcast_add(&ahead.of_contexts(&views.mean)?)?;
+        Ok(FlowPrediction {
+            frames: ahead.in_rows(&frames)?,
+            scene: None,
+            movers: self.movers_plainly(&steps)?,
+            motion: steps.ahead.motion,
+        })
+    }
+
+    /// What stands around the robot of one rollout.
+    pub(in crate::nn::flow) fn look_around_plainly(
+        &self,
+        row: &RolloutRows,
+        head: &DepthHead,
+    ) -> Result<SeenAround, NnError> {
+        let steps = self.see_steps(row, head, self.spec.horizon)?;
+        let values = |tensor: &Tensor| tensor.flatten_all()?.to_vec1::<f32>();
+        let movers = match self.movers_plainly(&steps)? {
+            None => None,
+            Some(logits) => Some(SeenMovers {
+                logits: values(&logits)?,
+                motions: values(&steps.ahead.motion)?,
+            }),
+        };
+        Ok(SeenAround {
+            depths_m: values(&steps.depths)?,
+            first_depths_m: values(&steps.views.depths)?,
+            movers,
+        })
+    }
+
+    fn see_steps(&self, rows: &RolloutRows, head: &DepthHead, steps: usize) -> Result<SeenSteps, NnError> {
         let size = self.spec.image_size();
         let contexts = rows.contexts(self.sizes.layers.frames_read);
         let views = SeenViews::of(&contexts, self.device())?;
@@ -33,60 +92,43 @@ impl FlowNetwork {
         let [coarse, _] = features;
         let ahead = self.ahead(rows, steps)?;
 
-        let cameras: Vec<CameraModel> = (ahead.context_of.iter())
-            .map(|&context| views.cameras[context as usize])
-            .collect();
+        let of_item = |&context: &u32| views.cameras[context as usize];
+        let cameras: Vec<CameraModel> = ahead.context_of.iter().map(of_item).collect();
         let cameras = Cameras::new(&cameras, size, self.device())?;
         let seen = reproject(&cameras, size, &ahead.of_contexts(&depths)?, &ahead.item_motion)?;
         let known = ahead.of_contexts(&views.known)?;
-        let coarse_places = seen.places.room.detach().coarse(size)?;
-        let quarter = size.shrunk(4);
-        let is_seen = coarse_places.inside(quarter, 0.5)?;
-        let mixed = Tensor::cat(
-            &[
-                sample_features(&ahead.of_contexts(&coarse)?, &coarse_places)?,
-                corners(&known, size.shrunk(2))?,
-                is_seen.reshape((is_seen.dim(0)?, 1, quarter.height, quarter.width))?,
-            ],
-            1,
-        )?;
-        let state = self.state_plainly(&mixed, &ahead.modulation)?;
-
-        let last = ahead.of_contexts(&views.frames)?;
-        let moved = moved_blocks(&last, size, &seen.places.room)?;
-        let head = self.head_plainly(&state, &moved, &beside_pixels(&known, &seen, size)?)?;
-        let frames = seen.places.compose(&last, size, &head, &last.zeros_like()?)?;
-        let frames = frames
-            .broadcast_mul(&ahead.of_contexts(&views.spread)?)?
-            .broadcast_add(&ahead.of_contexts(&views.mean)?)?;
-        Ok(FlowPrediction {
-            frames: ahead.in_rows(&frames)?,
-            scene: None,
-            movers: self.movers_plainly(&coarse, &state, &ahead)?,
-            motion: ahead.motion,
+        let (places, quarter) = (seen.places.room.detach().coarse(size)?, size.shrunk(4));
+        let is_seen = places.inside(quarter, 0.5)?;
+        let warped = sample_features(&ahead.of_contexts(&coarse)?, &places)?;
+        let is_seen = is_seen.reshape((is_seen.dim(0)?, 1, quarter.height, quarter.width))?;
+        let mixed = Tensor::cat(&[warped, corners(&known, size.shrunk(2))?, is_seen], 1)?;
+        Ok(SeenSteps {
+            state: self.state_plainly(&mixed, &ahead.modulation)?,
+            views,
+            coarse,
+            depths,
+            ahead,
+            seen,
+            known,
         })
     }
 
     /// Where movers are in the last frame and in the steps of each rollout, as logits `[N, 1 + steps, P]`; `None` if the model does not
     /// tell.
-    fn movers_plainly(
-        &self,
-        coarse: &Tensor,
-        state: &Tensor,
-        ahead: &Ahead,
-    ) -> std::result::Result<Option<Tensor>, NnError> {
+    fn movers_plainly(&self, steps: &SeenSteps) -> Result<Option<Tensor>, NnError> {
         let Some(layers) = &self.movers else { return Ok(None) };
-        let [_, steps] = ahead.shape;
+        let SeenSteps {
+            coarse, ahead, state, ..
+        } = steps;
         let seen = ahead.in_rows(&ahead.of_contexts(&logits(&layers.seen, coarse)?)?)?;
         let coming = ahead.in_rows(&logits(&layers.coming, state)?)?;
-        debug_assert_eq!(coming.dim(1)?, steps);
         Ok(Some(Tensor::cat(&[&seen.narrow(1, 0, 1)?, &coming], 1)?))
     }
 }
 
 impl DepthHead {
     /// The depth of each pixel of the last frames `[contexts, P]`, over that before anything is learned.
-    fn depth_factors(&self, [coarse, first]: &[Tensor; 2]) -> Result<Tensor> {
+    fn depth_factors(&self, [coarse, first]: &[Tensor; 2]) -> candle_core::Result<Tensor> {
         let enlarged = pixel_shuffle(&linear_per_place(&self.enlarge, &coarse.silu()?)?)?.silu()?;
         let logarithm = convolution(&self.output, &Tensor::cat(&[&enlarged, first], 1)?)?;
         let logarithm = pixel_shuffle(&logarithm)?.flatten_from(1)?;
@@ -95,13 +137,13 @@ impl DepthHead {
 }
 
 /// The logits of movers `[…, P]` from features on the grid of a quarter of the sides.
-fn logits(layer: &Linear, features: &Tensor) -> Result<Tensor> {
+fn logits(layer: &Linear, features: &Tensor) -> candle_core::Result<Tensor> {
     let blocks = linear_per_place(layer, &features.silu()?)?;
     pixel_shuffle(&pixel_shuffle(&blocks)?)?.flatten_from(1)
 }
 
 /// What the fine layers read beside the moved pixels, `[M, FINE_VALUES, H/2, W/2]`: of each block's upper left pixel.
-fn beside_pixels(known: &Tensor, seen: &Reprojected, size: ImageSize) -> Result<Tensor> {
+fn beside_pixels(known: &Tensor, seen: &Reprojected, size: ImageSize) -> candle_core::Result<Tensor> {
     let image = |values: &Tensor| values.reshape((values.dim(0)?, 1, size.height, size.width));
     let inverse = at_least(&seen.depths, LEAST_DEPTH_M.into())?.recip()?;
     let outside = (seen.places.room.detach().outside(size)? * (1.0 / f64::from(OUTSIDE_PX)))?;
@@ -111,7 +153,7 @@ fn beside_pixels(known: &Tensor, seen: &Reprojected, size: ImageSize) -> Result<
 }
 
 /// The upper left of each four places of images of that size: half the sides.
-fn corners(images: &Tensor, size: ImageSize) -> Result<Tensor> {
+fn corners(images: &Tensor, size: ImageSize) -> candle_core::Result<Tensor> {
     let (items, channels, _, _) = images.dims4()?;
     let half = size.shrunk(2);
     let blocks = images.reshape(&[items, channels, half.height, 2, half.width, 2][..])?;
