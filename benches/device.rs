@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 
 use candle_core::{Device, Tensor};
 use foreframe_core::nn::device::{self, DeviceName};
-use foreframe_core::nn::{ConditioningTensors, ModelSpec};
+use foreframe_core::nn::{ConditioningTensors, ModelSpec, NnError};
 use foreframe_core::registry::{self, Model};
 
 #[global_allocator]
@@ -40,12 +40,11 @@ impl Batch {
     }
 
     /// The predicted frames.
-    fn predict(&self, model: &Model) -> Vec<f32> {
-        let codes = model
-            .network
-            .predict_rollouts(&self.codes, &self.windows, &self.condition);
-        let frames = model.network.decode_frames(&codes.unwrap().flatten(0, 1).unwrap());
-        frames.unwrap().flatten_all().unwrap().to_vec1().unwrap()
+    fn predict(&self, model: &Model) -> Result<Vec<f32>, NnError> {
+        let network = &model.network;
+        let codes = network.predict_rollouts(&self.codes, &self.windows, &self.condition)?;
+        let frames = network.decode_frames(&codes.flatten(0, 1)?)?;
+        Ok(frames.flatten_all()?.to_vec1()?)
     }
 }
 
@@ -123,11 +122,18 @@ fn main() {
             ("256 plans", Batch::new(cpu, 1, PLANS)),
         ];
         for (label, batch) in batches {
-            let (expected, found) = (batch.predict(cpu), batch.predict(&moved));
+            let (expected, found) = match [cpu, &moved].map(|model| batch.predict(model)) {
+                [Ok(expected), Ok(found)] => (expected, found),
+                results => {
+                    let error = results.into_iter().find_map(Result::err).unwrap();
+                    println!("| {model_name} | {label} | {error:?} |");
+                    continue;
+                }
+            };
             let differences = || expected.iter().zip(&found).map(|(a, b)| (a - b).abs());
             let most = differences().fold(0.0, f32::max);
             let mean = differences().map(f64::from).sum::<f64>() / expected.len() as f64;
-            let [slow, fast] = [cpu, &moved].map(|model| least_time(|| drop(batch.predict(model))));
+            let [slow, fast] = [cpu, &moved].map(|model| least_time(|| drop(batch.predict(model).unwrap())));
             let [slow, fast] = [slow, fast].map(|time| time.as_secs_f64() * 1e3);
             println!("| {model_name} | {label} | {most:.1e} | {mean:.1e} | {slow:.2} | {fast:.2} |");
         }

@@ -70,11 +70,6 @@ pub enum NnError {
     /// Two forms of the flow network at once.
     #[error("model specification: flow.recurrent and flow.depth are both true; a network has one of these forms")]
     RecurrentDepth,
-    /// The recurrent form of the flow network runs on the CPU only.
-    #[error(
-        "flow.recurrent is true: the recurrent form of the flow network runs on the CPU only; set device to \"cpu\""
-    )]
-    RecurrentDevice,
     /// This device cannot be used.
     #[error("device is \"{device}\": {reason}")]
     Device {

@@ -235,6 +235,16 @@ fn the_form_of_a_standing_camera_agrees() {
 }
 
 #[test]
+fn the_recurrent_form_agrees() {
+    let layers = FlowLayers {
+        recurrent: true,
+        ..FlowLayers::default()
+    };
+    assert_flow_agrees(layers, None, Conditioning::None);
+    assert_flow_agrees(layers, camera(), Conditioning::State);
+}
+
+#[test]
 fn the_dense_network_agrees() {
     for (reconstruction, predictor_output) in [
         (Reconstruction::Sequence, PredictorOutput::Residual),

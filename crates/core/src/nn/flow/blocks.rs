@@ -8,6 +8,8 @@ use crate::nn::ops::sampling::ImageSize;
 
 /// Channels of the moved pixels that the fine layers read: a 2×2 block and the share inside the frame.
 pub(super) const MOVED_CHANNELS: usize = 5;
+/// Of these, the channels that hold pixels.
+pub(super) const BLOCK_PIXELS: usize = MOVED_CHANNELS - 1;
 
 /// A column or row as −1 to 1.
 pub(super) fn centred(at: usize, side: usize) -> f32 {

@@ -2,13 +2,14 @@
 //! cards. All steps of all rollouts are computed together. Small things stay on the CPU: the wheels' integral and where the state says
 //! that the camera stands.
 //!
-//! Reading order: `cameras` → `depth_views`, `reprojection`, `depth` or `room`, `scene`, `direct` → `composition`.
+//! Reading order: `cameras` → `depth_views`, `reprojection`, `depth` or `room`, `scene`, `direct`, `recurrent` → `composition`.
 
 mod cameras;
 mod composition;
 mod depth;
 mod depth_views;
 mod direct;
+mod recurrent;
 mod reprojection;
 mod room;
 mod scene;
@@ -71,7 +72,9 @@ impl FlowNetwork {
     fn predict_rows_plainly(&self, rows: &RolloutRows, steps: usize) -> Result<FlowPrediction, NnError> {
         match &self.surroundings {
             Surroundings::Seen(depth) => self.predict_with_depth_plainly(rows, depth, steps),
-            Surroundings::Remembered(_) if self.sizes.layers.recurrent => Err(NnError::RecurrentDevice),
+            Surroundings::Remembered(scene) if self.sizes.layers.recurrent => {
+                self.predict_recurrently_plainly(rows, scene, steps)
+            }
             Surroundings::Remembered(scene) => self.predict_directly_plainly(rows, scene, steps),
         }
     }
@@ -82,13 +85,9 @@ impl FlowNetwork {
 
     /// What is known of the first `steps` of the rollouts before their frames are computed.
     fn ahead(&self, rows: &RolloutRows, steps: usize) -> Result<Ahead, NnError> {
-        let (count, horizon) = (rows.count(), self.spec.horizon);
+        let count = rows.count();
         let motion = self.motion.forward_plainly(rows, self.device())?;
-        let mut inputs = rows.step_inputs()?.to_device(self.device())?;
-        if self.motion.is_moving() {
-            inputs = Tensor::cat(&[&inputs, &motion.flatten(0, 1)?], 1)?;
-        }
-        let modulation = perceptron(&self.modulation, &inputs)?.reshape((count, horizon, ()))?;
+        let modulation = self.modulate_plainly(rows, &motion)?;
         let of_steps = |of_all: &Tensor| of_all.narrow(1, 0, steps)?.contiguous()?.flatten(0, 1);
         let contexts = rows.context_of().into_iter();
         Ok(Ahead {
@@ -101,6 +100,16 @@ impl FlowNetwork {
             row_of: (0..count).flat_map(|row| std::iter::repeat_n(row, steps)).collect(),
             shape: [count, steps],
         })
+    }
+
+    /// Scales and shifts of the modulated layers `[N, horizon, …]`.
+    fn modulate_plainly(&self, rows: &RolloutRows, motion: &Tensor) -> Result<Tensor, NnError> {
+        let mut inputs = rows.step_inputs()?.to_device(self.device())?;
+        if self.motion.is_moving() {
+            inputs = Tensor::cat(&[&inputs, &motion.flatten(0, 1)?], 1)?;
+        }
+        let modulation = perceptron(&self.modulation, &inputs)?;
+        Ok(modulation.reshape((rows.count(), self.spec.horizon, ()))?)
     }
 
     /// Features of each context `[contexts, C, H/4, W/4]` and those of the first layer `[contexts, …, H/2, W/2]`, from the encoder's
@@ -117,7 +126,11 @@ impl FlowNetwork {
 
     /// The items' states `[M, C, H/4, W/4]` after the decoder's modulated blocks, from what they are mixed of.
     fn state_plainly(&self, mixed: &Tensor, modulation: &Tensor) -> Result<Tensor, NnError> {
-        let mut state = linear_per_place(&self.mix, mixed)?;
+        self.refined_plainly(linear_per_place(&self.mix, mixed)?, modulation)
+    }
+
+    /// The states after the modulated blocks.
+    fn refined_plainly(&self, mut state: Tensor, modulation: &Tensor) -> Result<Tensor, NnError> {
         let channels = self.sizes.layers.channels;
         for (index, [first, second]) in self.refine.iter().enumerate() {
             let modulation = |part: usize| modulation.narrow(1, (2 * index + part) * 2 * channels, 2 * channels);

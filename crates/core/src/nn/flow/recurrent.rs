@@ -4,7 +4,7 @@
 
 use candle_core::{DType, Device, Tensor};
 
-use super::blocks::{MOVED_CHANNELS, content_frames, sampled_blocks};
+use super::blocks::{BLOCK_PIXELS, content_frames, sampled_blocks};
 use super::network::{FlowNetwork, FlowPrediction};
 use super::rollout_rows::RolloutRows;
 use super::scene::Scene;
@@ -15,9 +15,6 @@ use crate::nn::ops::linear::per_place;
 use crate::nn::ops::pixel_shuffle::pixel_unshuffle;
 use crate::nn::ops::sampling::{own_places, sample_features};
 use crate::nn::tensors::with_values;
-
-/// Of the blocks to move, the channels that hold pixels; the last one says how much of a block is inside the frame.
-const BLOCK_PIXELS: usize = MOVED_CHANNELS - 1;
 
 impl FlowNetwork {
     /// The rollouts of a model that takes no actions: its camera stands. Only the first `steps` frames are computed.

@@ -63,14 +63,19 @@ impl FlowNetwork {
     }
 
     /// The last frames `[contexts, P]`.
-    fn last_frames(&self, contexts: &EncoderViews) -> Result<Tensor, NnError> {
+    pub(super) fn last_frames(&self, contexts: &EncoderViews) -> Result<Tensor, NnError> {
         let shape = (contexts.count(), self.spec.pixels());
         Ok(Tensor::from_slice(&contexts.last_frames, shape, self.device())?)
     }
 
     /// The inputs of the encoder `[contexts, channels, H/2, W/2]`: blocks of the last frames, of the earlier ones turned into the last
     /// one's view by the measured yaw rate, and of the scene without movers; and the place in the frame.
-    fn encoder_inputs(&self, contexts: &EncoderViews, last: &Tensor, scene: &Scene) -> Result<Tensor, NnError> {
+    pub(super) fn encoder_inputs(
+        &self,
+        contexts: &EncoderViews,
+        last: &Tensor,
+        scene: &Scene,
+    ) -> Result<Tensor, NnError> {
         let (size, device) = (self.spec.image_size(), self.device());
         let (count, pixels, earlier) = (contexts.count(), size.pixels(), contexts.frames_read - 1);
         let mut inputs = vec![blocks(last, size)?];
@@ -105,7 +110,7 @@ impl FlowNetwork {
     }
 
     /// The states `[M, S]`, scaled; `None` where the model takes none.
-    fn scaled_states<'s>(&self, states: impl Iterator<Item = &'s [f32]>) -> Result<Option<Tensor>, NnError> {
+    pub(super) fn scaled_states<'s>(&self, states: impl Iterator<Item = &'s [f32]>) -> Result<Option<Tensor>, NnError> {
         let rows: Vec<Vec<f32>> = states.map(|state| self.spec.scaled_state(state)).collect();
         let shape = (rows.len(), rows.first().map_or(0, Vec::len));
         let is_given = shape.1 > 0;
@@ -171,6 +176,6 @@ impl FlowNetwork {
 }
 
 /// The content of a scene `[M, SCENE_CHANNELS, H/2, W/2]`, `[M, 4, H/2, W/2]`.
-fn content(scene: &Tensor) -> Result<Tensor, NnError> {
+pub(super) fn content(scene: &Tensor) -> Result<Tensor, NnError> {
     Ok(scene.narrow(1, SCENE_FEATURES, SCENE_CHANNELS - SCENE_FEATURES)?)
 }
