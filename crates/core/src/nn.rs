@@ -1,15 +1,19 @@
 //! The networks, written with candle.
 //!
 //! Symbols in shapes: B windows of a batch, N frames, T time steps, P pixels of a frame, F features of a frame, D inputs of
-//! a layer, H hidden units of an LSTM, A components of an action, S components of a state. All tensors are f32, row-major,
-//! on the CPU. Frames are in the model's value range ([`crate::frame::preprocess`]).
+//! a layer, H hidden units of an LSTM, A components of an action, S components of a state. All tensors are f32 and row-major.
+//! Inputs and parameters are on the CPU. Frames are in the model's value range ([`crate::frame::preprocess`]).
 //!
 //! There are two architectures: the paper's in [`dense`] (a codec of single frames, a peephole LSTM that encodes the context,
 //! one LSTM decoder that predicts the next frames and one that reconstructs the context), and [`flow`], which moves the
 //! pixels of the last frame. Neither uses the other. [`network`] is the type that the rest of the program uses for both.
 //!
-//! The modules in reading order; each uses only those above it: `options` (enumerations) → [`error`] → [`tensors`] → `fused`
-//! (what an operation with a gradient of its own is) → `ops` (such operations) → [`loss`], [`ssim_loss`], [`mask_loss`] →
+//! On the CPU, a network computes in fused operations (`ops`). In `plain` and in the folders of that name inside [`dense`] and [`flow`],
+//! the same networks are written in candle's own tensor operations: short to read, and the path of graphics cards ([`device`]).
+//! `plain_agreement` tests that both give the same predictions and gradients.
+//!
+//! The modules in reading order; each uses only those above it: `options` (enumerations) → [`error`] → [`device`] → [`tensors`] → `fused`
+//! (what an operation with a gradient of its own is) → `ops` (such operations) → `plain` → [`loss`], [`ssim_loss`], [`mask_loss`] →
 //! [`spec`] (sizes and meaning of a model) → `model_tensors`, `conditioning` (actions and state) → `geometry` (cameras and wheels) → [`dense`], [`flow`] → `model_size` (tensors and cost) → `init`, [`parameters`] →
 //! [`network`]. [`costs`] compares the model's cost with other networks.
 
