@@ -168,7 +168,7 @@ fn assert_flow_agrees(layers: FlowLayers, camera: Option<CameraModel>, condition
 
 /// What stands around the robot in each window, as numbers.
 fn assert_occupancy_agrees(layers: FlowLayers) {
-    let spec = spec(flow(layers, camera()), Conditioning::StateAction);
+    let spec = spec(flow(layers, Some(camera())), Conditioning::StateAction);
     let parameters = parameters(&spec);
     let networks = [
         Network::detached(spec.clone(), &parameters).unwrap(),
@@ -199,11 +199,11 @@ fn assert_occupancy_agrees(layers: FlowLayers) {
     }
 }
 
-fn camera() -> Option<CameraModel> {
-    Some(CameraModel {
+fn camera() -> CameraModel {
+    CameraModel {
         height_m: Some(0.4),
         ..CameraModel::new(1.1, 0.25).unwrap()
-    })
+    }
 }
 
 #[test]
@@ -213,20 +213,20 @@ fn the_form_that_estimates_depth_agrees() {
         movers: true,
         ..FlowLayers::default()
     };
-    assert_flow_agrees(layers, camera(), Conditioning::StateAction);
+    assert_flow_agrees(layers, Some(camera()), Conditioning::StateAction);
     assert_flow_agrees(layers, None, Conditioning::Action);
     assert_occupancy_agrees(layers);
 }
 
 #[test]
 fn the_form_with_a_learned_room_agrees() {
-    assert_flow_agrees(FlowLayers::default(), camera(), Conditioning::StateAction);
+    assert_flow_agrees(FlowLayers::default(), Some(camera()), Conditioning::StateAction);
 }
 
 #[test]
 fn the_form_without_a_camera_agrees() {
     assert_flow_agrees(FlowLayers::default(), None, Conditioning::StateAction);
-    assert_flow_agrees(FlowLayers::default(), camera(), Conditioning::Action);
+    assert_flow_agrees(FlowLayers::default(), Some(camera()), Conditioning::Action);
 }
 
 #[test]
@@ -241,7 +241,7 @@ fn the_recurrent_form_agrees() {
         ..FlowLayers::default()
     };
     assert_flow_agrees(layers, None, Conditioning::None);
-    assert_flow_agrees(layers, camera(), Conditioning::State);
+    assert_flow_agrees(layers, Some(camera()), Conditioning::State);
 }
 
 #[test]
@@ -255,7 +255,6 @@ fn the_dense_network_agrees() {
             hidden: 10,
             reconstruction,
             predictor_output,
-            ..DenseSpec::default()
         };
         let spec = spec(Architecture::Dense(sizes), Conditioning::StateAction);
         assert_agreement(&spec, |network| {

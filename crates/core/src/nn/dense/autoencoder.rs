@@ -73,12 +73,12 @@ impl DenseNetwork {
 
     /// Encodes frames `[N, P]` in the model's value range to features `[N, F]`.
     pub(in crate::nn) fn encode_frames(&self, frames: &Tensor) -> Result<Tensor, NnError> {
-        self.finished(self.layers.linear(&self.frame_encoder, &self.moved(frames)?)?)
+        Self::finished(self.layers.linear(&self.frame_encoder, &self.moved(frames)?)?)
     }
 
     /// Decodes features `[N, F]` to frames `[N, P]` in the model's value range, not clamped.
     pub(in crate::nn) fn decode_frames(&self, features: &Tensor) -> Result<Tensor, NnError> {
-        self.finished(self.layers.linear(&self.frame_decoder, &self.moved(features)?)?)
+        Self::finished(self.layers.linear(&self.frame_decoder, &self.moved(features)?)?)
     }
 
     /// Predicts the features `[B, horizon, F]` of the frames that follow the context `features` `[B, context, F]`, from the
@@ -138,7 +138,7 @@ impl DenseNetwork {
             first: &first,
             conditions: conditions.as_ref(),
         };
-        self.finished(self.layers.decode(&decoder, inputs, &state)?)
+        Self::finished(self.layers.decode(&decoder, inputs, &state)?)
     }
 
     /// Reconstructs the features `[B, context, F]` from the encoder's output. Approach 1 (sequence): the decoder starts from
@@ -168,7 +168,7 @@ impl DenseNetwork {
                 self.each_step(&self.reconstructor_output, &outputs)?
             }
         };
-        self.finished(reconstructed)
+        Self::finished(reconstructed)
     }
 
     /// A layer at each step of `[B, T, …]`.
@@ -190,7 +190,7 @@ impl DenseNetwork {
     }
 
     /// A result: without gradients, on the CPU.
-    fn finished(&self, tensor: Tensor) -> Result<Tensor, NnError> {
+    fn finished(tensor: Tensor) -> Result<Tensor, NnError> {
         if tensor.track_op() {
             return Ok(tensor);
         }

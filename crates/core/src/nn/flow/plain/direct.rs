@@ -36,7 +36,7 @@ impl FlowNetwork {
 
         let poses: Vec<CameraPose> = ahead.row_of.iter().map(|&row| rows.pose(row)).collect();
         let before = self.room_poses(scene, &poses)?;
-        let after = self.moved_poses(scene, before.as_ref(), &ahead.item_motion.detach())?;
+        let after = moved_poses(scene, before.as_ref(), &ahead.item_motion.detach())?;
         let places = self.places_plainly(scene, &ahead, before.as_ref().zip(after.as_ref()))?;
         let states = ahead.row_of.iter().map(|&row| rows.state(row));
         let views = SceneItems {
@@ -126,19 +126,6 @@ impl FlowNetwork {
         Ok(Some(RoomPoses::of(scale, poses, self.device())?))
     }
 
-    /// The poses after the motions, where there is a room.
-    fn moved_poses(
-        &self,
-        scene: &Scene,
-        before: Option<&RoomPoses>,
-        motions: &Tensor,
-    ) -> Result<Option<RoomPoses>, NnError> {
-        match (scene.kind, before) {
-            (SceneKind::Room(scale, _), Some(before)) => Ok(Some(before.moved(motions, scale.unit)?)),
-            _ => Ok(None),
-        }
-    }
-
     /// Where each item's pixels were in the last frame.
     fn places_plainly(
         &self,
@@ -178,4 +165,12 @@ impl FlowNetwork {
 /// The content of a scene `[M, SCENE_CHANNELS, H/2, W/2]`, `[M, 4, H/2, W/2]`.
 pub(super) fn content(scene: &Tensor) -> Result<Tensor, NnError> {
     Ok(scene.narrow(1, SCENE_FEATURES, SCENE_CHANNELS - SCENE_FEATURES)?)
+}
+
+/// The poses after the motions, where there is a room.
+fn moved_poses(scene: &Scene, before: Option<&RoomPoses>, motions: &Tensor) -> Result<Option<RoomPoses>, NnError> {
+    match (scene.kind, before) {
+        (SceneKind::Room(scale, _), Some(before)) => Ok(Some(before.moved(motions, scale.unit)?)),
+        _ => Ok(None),
+    }
 }
