@@ -166,3 +166,27 @@ fn a_password_is_not_printed() {
         "{text}"
     );
 }
+
+#[test]
+fn a_device_is_named_and_one_that_cannot_be_used_is_refused_with_its_source() {
+    let set = |text: &str| vec![SettingsLayer::assignment(text).unwrap()];
+    let error = refused(set("device=gpu"));
+    assert!(
+        error.contains("device is \"gpu\" (--set)") && error.contains("cuda:N"),
+        "{error}"
+    );
+    LoadedConfig::from_layers(set("device=cpu"))
+        .unwrap()
+        .choose_device()
+        .unwrap();
+    // Built without CUDA, or with it and no 99th card.
+    let loaded = LoadedConfig::from_layers(set("device=cuda:99")).unwrap();
+    let error = loaded.choose_device().unwrap_err().to_string();
+    assert!(
+        error.contains("device is \"cuda:99\"") && error.contains("(--set)"),
+        "{error}"
+    );
+    if !cfg!(feature = "cuda") {
+        assert!(error.contains("cargo build --release --features cuda"), "{error}");
+    }
+}

@@ -87,8 +87,11 @@ fn open(name: DeviceName) -> Result<Device, NnError> {
         return Err(refused(reason.to_owned()));
     }
     Device::new_cuda(number).map_err(|error| {
+        // What follows the first line is a list of functions.
+        let error = error.to_string();
+        let error = error.lines().next().unwrap_or_default();
         refused(format!(
-            "there is no such graphics card, or its driver does not work ({error}); see `nvidia-smi`, or set device to \"cpu\""
+            "there is no such graphics card, or its driver does not work ({error}); `nvidia-smi` lists the cards"
         ))
     })
 }

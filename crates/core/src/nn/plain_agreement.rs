@@ -1,15 +1,19 @@
 //! Both networks in plain tensor operations against the fused operations: predictions, and gradients of a loss.
 
-use candle_core::{DType, Device, Tensor};
+use candle_core::{DType, Device, Tensor, Var};
 
 use super::conditioning::ConditioningTensors;
 use super::dense::Feedback;
 use super::flow::{FlowPrediction, Occupancy};
 use super::gradient_check::{noise, values};
+use super::loss::Loss;
+use super::mask_loss::mask_loss;
 use super::network::Network;
 use super::options::{Conditioning, PredictorOutput, Reconstruction};
 use super::parameters::Parameters;
+use super::plain::losses;
 use super::spec::{Architecture, ChannelScale, DenseSpec, FlowLayers, FlowSpec, ModelSpec};
+use super::ssim_loss::ssim_loss;
 use crate::frame::warp::CameraModel;
 use crate::types::Seed;
 
@@ -272,5 +276,25 @@ fn the_dense_network_agrees() {
             outputs.push(network.decode_frames(&outputs[0].flatten(0, 1).unwrap()).unwrap());
             outputs
         });
+    }
+}
+
+#[test]
+fn the_losses_agree() {
+    let prediction = Var::from_tensor(&noise(&[2, 3, 12 * 14], 1)).unwrap();
+    let x = prediction.as_tensor();
+    let target = noise(&[2, 3, 12 * 14], 2);
+    let mask = target.gt(0.0).unwrap().to_dtype(DType::F32).unwrap();
+    let pairs = [
+        (losses::squared(x, &target), Loss::Mse.between(x, &target)),
+        (losses::absolute(x, &target), Loss::L1.between(x, &target)),
+        (losses::cross_entropy(x, &mask), mask_loss(x, &mask)),
+        (losses::dissimilarity(x, &target, 14), ssim_loss(x, &target, 14)),
+    ];
+    for (plain, fused) in pairs {
+        let (plain, fused) = (plain.unwrap(), fused.unwrap());
+        assert!(largest_difference(&plain, &fused) < 1e-5);
+        let slopes = [plain, fused].map(|loss| loss.backward().unwrap().get(x).unwrap().clone());
+        assert!(largest_difference(&slopes[0], &slopes[1]) < 1e-6);
     }
 }

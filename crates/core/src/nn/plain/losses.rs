@@ -56,37 +56,3 @@ fn blur(side: usize, like: &Tensor) -> Result<Tensor> {
     }
     Tensor::from_vec(shares, (side, side), like.device())
 }
-
-#[cfg(test)]
-mod tests {
-    use candle_core::Var;
-
-    use super::*;
-    use crate::nn::gradient_check::{noise, values};
-    use crate::nn::loss::Loss;
-    use crate::nn::mask_loss::mask_loss;
-    use crate::nn::ssim_loss::ssim_loss;
-
-    #[test]
-    fn values_and_gradients_are_those_of_the_fused_losses() {
-        let prediction = Var::from_tensor(&noise(&[2, 3, 12 * 14], 1)).unwrap();
-        let x = prediction.as_tensor();
-        let target = noise(&[2, 3, 12 * 14], 2);
-        let mask = target.gt(0.0).unwrap().to_dtype(x.dtype()).unwrap();
-        let pairs = [
-            (squared(x, &target), Loss::Mse.between(x, &target)),
-            (absolute(x, &target), Loss::L1.between(x, &target)),
-            (cross_entropy(x, &mask), mask_loss(x, &mask)),
-            (dissimilarity(x, &target, 14), ssim_loss(x, &target, 14)),
-        ];
-        for (plain, fused) in pairs {
-            let (plain, fused) = (plain.unwrap(), fused.unwrap());
-            let [found, expected] = [&plain, &fused].map(|loss| loss.to_scalar::<f32>().unwrap());
-            assert!((found - expected).abs() < 1e-5, "{found} {expected}");
-            let slopes = [plain, fused].map(|loss| values(loss.backward().unwrap().get(x).unwrap()));
-            for (found, expected) in slopes[0].iter().zip(&slopes[1]) {
-                assert!((found - expected).abs() < 1e-6, "{found} {expected}");
-            }
-        }
-    }
-}
