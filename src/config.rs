@@ -196,8 +196,12 @@ impl LoadedConfig {
     /// Makes the networks of this process compute on the configured device. Errors: `Value`.
     pub fn choose_device(&self) -> Result<(), ConfigError> {
         let origin = self.values.origin("device");
-        let refused = |error: NnError| ConfigError::Value(format!("{error} ({origin})"));
-        device::choose(self.config.server.device).map_err(refused)
+        let refused = |error| match error {
+            NnError::Device { device, reason } => format!("device is \"{device}\" ({origin}): {reason}"),
+            other => other.to_string(),
+        };
+        let chosen = device::choose(self.config.server.device);
+        chosen.map_err(|error| ConfigError::Value(refused(error)))
     }
 
     /// The settings as TOML, each with its meaning and origin; passwords in URLs are hidden.
