@@ -131,11 +131,11 @@ fn main() {
                 }
             };
             let differences = || expected.iter().zip(&found).map(|(a, b)| (a - b).abs());
-            let most = differences().fold(0.0, f32::max);
+            let most = differences().max_by(f32::total_cmp).unwrap_or(0.0);
             let mean = differences().map(f64::from).sum::<f64>() / expected.len() as f64;
-            let [slow, fast] = [cpu, &moved].map(|model| least_time(|| drop(batch.predict(model).unwrap())));
-            let [slow, fast] = [slow, fast].map(|time| time.as_secs_f64() * 1e3);
-            println!("| {model_name} | {label} | {most:.1e} | {mean:.1e} | {slow:.2} | {fast:.2} |");
+            let [cpu_ms, device_ms] = [cpu, &moved].map(|model| least_time(|| drop(batch.predict(model).unwrap())));
+            let [cpu_ms, device_ms] = [cpu_ms, device_ms].map(|time| time.as_secs_f64() * 1e3);
+            println!("| {model_name} | {label} | {most:.1e} | {mean:.1e} | {cpu_ms:.2} | {device_ms:.2} |");
         }
     }
 }

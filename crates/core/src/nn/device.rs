@@ -1,16 +1,19 @@
-//! The device that networks compute on. The program chooses it once, when it starts; without a choice it is the CPU.
+//! The device that networks compute on. The program chooses it once, when it starts; without a choice it is the CPU. A graphics card is
+//! opened when the first network is built, so that commands without networks need none.
 
 use std::fmt;
 use std::str::FromStr;
 use std::sync::OnceLock;
 
-use candle_core::Device;
+use candle_core::{DType, Device, Tensor};
 use serde::{Deserialize, Serialize};
 
 use super::error::NnError;
 
 /// The chosen device.
-static CHOSEN: OnceLock<Device> = OnceLock::new();
+static CHOSEN: OnceLock<DeviceName> = OnceLock::new();
+/// The graphics card, or why it cannot be used.
+static CARD: OnceLock<Result<Device, String>> = OnceLock::new();
 
 /// The name of a device: `cpu`, `cuda` or `cuda:N`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -61,38 +64,52 @@ impl From<DeviceName> for String {
     }
 }
 
-/// Makes all networks that are built from now on compute there. Only the first choice counts. Errors: `Device` if this program cannot
-/// use it.
+/// Makes all networks that are built from now on compute there. Errors: `Device` if this program is built without CUDA, or another device
+/// was chosen before.
 pub fn choose(name: DeviceName) -> Result<(), NnError> {
-    let device = open(name)?;
-    CHOSEN.get_or_init(|| device);
+    if name != DeviceName::Cpu && !candle_core::utils::cuda_is_available() {
+        let reason = "this program was built without CUDA; build it with `cargo build --release --features cuda`";
+        return Err(refused(name, reason));
+    }
+    let chosen = *CHOSEN.get_or_init(|| name);
+    if chosen != name {
+        return Err(refused(name, &format!("this process already computes on \"{chosen}\"")));
+    }
     Ok(())
 }
 
-/// The device of new networks.
-pub(super) fn current() -> Device {
-    CHOSEN.get().cloned().unwrap_or(Device::Cpu)
+/// The device of new networks. Errors: `Device` if it cannot be used.
+pub(super) fn current() -> Result<Device, NnError> {
+    match CHOSEN.get() {
+        None | Some(DeviceName::Cpu) => Ok(Device::Cpu),
+        Some(&name @ DeviceName::Cuda(number)) => {
+            let card = CARD.get_or_init(|| open(number));
+            card.clone().map_err(|reason| refused(name, &reason))
+        }
+    }
 }
 
-fn open(name: DeviceName) -> Result<Device, NnError> {
-    let DeviceName::Cuda(number) = name else {
-        return Ok(Device::Cpu);
-    };
-    let refused = |reason: String| NnError::Device {
+fn refused(name: DeviceName, reason: &str) -> NnError {
+    NnError::Device {
         device: name.to_string(),
-        reason,
-    };
-    if !candle_core::utils::cuda_is_available() {
-        let reason = "this program was built without CUDA; build it with `cargo build --release --features cuda`";
-        return Err(refused(reason.to_owned()));
+        reason: reason.to_owned(),
     }
-    Device::new_cuda(number).map_err(|error| {
+}
+
+/// Opens a card and computes something on it, since candle loads its kernels late. All threads share one queue of operations: candle's
+/// own choice, one for each thread, does not order them.
+fn open(number: usize) -> Result<Device, String> {
+    let tried = || -> candle_core::Result<Device> {
+        let device = Device::new_cuda_with_stream(number)?;
+        let ones = Tensor::ones(1, DType::F32, &device)?;
+        (&ones + &ones)?.to_vec1::<f32>()?;
+        Ok(device)
+    };
+    tried().map_err(|error| {
         // What follows the first line is a list of functions.
         let error = error.to_string();
         let error = error.lines().next().unwrap_or_default();
-        refused(format!(
-            "there is no such graphics card, or its driver does not work ({error}); `nvidia-smi` lists the cards"
-        ))
+        format!("the graphics card cannot be used ({error}); `nvidia-smi` lists the cards and what uses them")
     })
 }
 
@@ -119,5 +136,8 @@ mod tests {
             error.contains("device is \"cuda\"") && error.contains("--features cuda"),
             "{error}"
         );
+        // The refused choice counts for nothing.
+        choose(DeviceName::Cpu).unwrap();
+        choose(DeviceName::Cpu).unwrap();
     }
 }

@@ -31,7 +31,8 @@ enum AnyNetwork {
 }
 
 impl Network {
-    /// A model that shares its storage with `parameters`: it sees every update, and gradients reach every tensor.
+    /// A model that shares its storage with `parameters`: it sees every update, and gradients reach every tensor. On a graphics card it
+    /// holds a copy, so it is to be built again after an update.
     /// Errors: `TensorMissing`, `TensorShape`, and those of [`ModelSpec::validate`].
     pub fn new(spec: ModelSpec, parameters: &Parameters) -> Result<Self, NnError> {
         Self::with_frozen(spec, parameters, &[])
@@ -56,7 +57,7 @@ impl Network {
     /// The network with its weights on the program's device; the parameters stay on the CPU, and their gradients come back to it.
     fn build(spec: ModelSpec, parameters: &Parameters, frozen: &[&str], always_plain: bool) -> Result<Self, NnError> {
         spec.validate()?;
-        let device = device::current();
+        let device = device::current()?;
         let mut tensors = BTreeMap::new();
         for (name, shape) in spec.tensor_shapes() {
             let tensor = of_shape(&name, &shape, parameters.get(&name).map(Var::as_tensor))?;

@@ -145,6 +145,7 @@ fn assert_agreement(spec: &ModelSpec, predict: impl Fn(&Network) -> Vec<Tensor>)
         let loss = weighted.reduce(|sum, part| (sum + part).unwrap()).unwrap();
         loss.backward().unwrap()
     });
+    let mut with_gradient = 0;
     for (name, var) in parameters.iter() {
         let of = |gradients: &candle_core::backprop::GradStore| {
             let none = || Tensor::zeros(var.dims(), DType::F32, &Device::Cpu).unwrap();
@@ -154,12 +155,18 @@ fn assert_agreement(spec: &ModelSpec, predict: impl Fn(&Network) -> Vec<Tensor>)
         let largest = values(&fused)
             .into_iter()
             .fold(0.0f32, |most, value| most.max(value.abs()));
+        with_gradient += usize::from(largest > 1e-2);
         let difference = largest_difference(&fused, &plain);
         assert!(
             difference <= 1e-3 * largest.max(1e-2),
             "{name}: {difference} of {largest}"
         );
     }
+    let count = parameters.iter().count();
+    assert!(
+        4 * with_gradient > 3 * count,
+        "{with_gradient} of {count} tensors have a gradient"
+    );
 }
 
 fn assert_flow_agrees(layers: FlowLayers, camera: Option<CameraModel>, conditions: Conditioning) {
@@ -168,6 +175,68 @@ fn assert_flow_agrees(layers: FlowLayers, camera: Option<CameraModel>, condition
         let predicted = network.predict_flow(&frames(spec.context), &conditioning(&spec), spec.horizon);
         outputs(&predicted.unwrap().unwrap())
     });
+}
+
+/// Several rollouts of a window, with different actions and cameras.
+fn assert_rollouts_agree(architecture: Architecture) {
+    let spec = spec(architecture, Conditioning::StateAction);
+    let windows = [0, 0, 1, 2, 2];
+    let rows = |tensor: Option<Tensor>| {
+        let tensor = tensor.unwrap();
+        let repeated = tensor
+            .index_select(&Tensor::new(&windows, &Device::Cpu).unwrap(), 0)
+            .unwrap();
+        Some(repeated)
+    };
+    let known = conditioning(&spec);
+    let camera_of = |row: usize| CameraModel {
+        tilt_down_rad: 0.1 + 0.05 * row as f32,
+        ..camera()
+    };
+    let conditioning = ConditioningTensors {
+        actions: Some((noise(&[windows.len(), spec.horizon, spec.actions.len()], 17) * 0.4).unwrap()),
+        state: rows(known.state),
+        past_states: rows(known.past_states),
+        cameras: (0..windows.len()).map(camera_of).collect(),
+    };
+    let parameters = parameters(&spec);
+    let [fused, plain] = [
+        Network::detached(spec.clone(), &parameters).unwrap(),
+        Network::plain(spec.clone(), &parameters, &[""]).unwrap(),
+    ]
+    .map(|network| {
+        let frames = frames(spec.context);
+        let codes = network.encode_frames(&frames.flatten(0, 1).unwrap()).unwrap();
+        let codes = codes.reshape((WINDOWS, spec.context, ())).unwrap();
+        network.predict_rollouts(&codes, &windows, &conditioning).unwrap()
+    });
+    assert_eq!(fused.dim(0).unwrap(), windows.len());
+    assert!(largest_difference(&fused, &plain) < 1e-5);
+    let [one, other] = [0, 1].map(|row| fused.get(row).unwrap());
+    assert!(
+        largest_difference(&one, &other) > 1e-4,
+        "the rollouts of a window differ"
+    );
+}
+
+#[test]
+fn several_rollouts_of_a_window() {
+    let depth = FlowLayers {
+        depth: true,
+        ..FlowLayers::default()
+    };
+    let dense = DenseSpec {
+        features: 6,
+        hidden: 5,
+        ..DenseSpec::default()
+    };
+    for architecture in [
+        flow(depth, Some(camera())),
+        flow(FlowLayers::default(), Some(camera())),
+        Architecture::Dense(dense),
+    ] {
+        assert_rollouts_agree(architecture);
+    }
 }
 
 /// What stands around the robot in each window, as numbers.

@@ -102,7 +102,7 @@ impl DenseNetwork {
         };
         let (outputs, _) = self.layers.unroll(&self.predictor, &inputs, &state)?;
         let outputs = self.each_step(&self.predictor_output, &outputs)?;
-        Ok(match self.sizes.predictor_output {
+        Self::finished(match self.sizes.predictor_output {
             PredictorOutput::Residual => (previous + outputs)?,
             PredictorOutput::Absolute => outputs,
         })

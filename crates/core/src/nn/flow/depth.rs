@@ -98,7 +98,7 @@ impl FlowNetwork {
         } else {
             self.look_around(row, head)?
         };
-        let logits = movers.as_ref().map(|movers| &movers.logits[..size.pixels()]);
+        let logits = movers.as_ref().and_then(|movers| movers.logits.get(..size.pixels()));
         Ok(Occupancy {
             points: view.points(&depths_m, logits),
             movers: movers.map_or_else(Vec::new, |movers| {
