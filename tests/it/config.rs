@@ -179,7 +179,7 @@ fn a_device_is_named_and_one_that_cannot_be_used_is_refused_with_its_source() {
         .unwrap()
         .choose_device()
         .unwrap();
-    // Built without CUDA, or with it and no 99th card.
+    // Built without CUDA; with it, this process has chosen the CPU above.
     let loaded = LoadedConfig::from_layers(set("device=cuda:99")).unwrap();
     let error = loaded.choose_device().unwrap_err().to_string();
     assert!(error.starts_with("device is \"cuda:99\" (--set): "), "{error}");

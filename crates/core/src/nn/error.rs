@@ -166,8 +166,8 @@ impl From<candle_core::Error> for NnError {
 impl HasErrorKind for NnError {
     fn kind(&self) -> ErrorKind {
         match self {
-            // A training takes these from its settings.
-            Self::OutOfRange { .. } | Self::NoChannels { .. } => ErrorKind::Usage,
+            // These come from settings.
+            Self::OutOfRange { .. } | Self::NoChannels { .. } | Self::Device { .. } => ErrorKind::Usage,
             Self::Tensor(_) => ErrorKind::Internal,
             _ => ErrorKind::Unusable,
         }

@@ -75,6 +75,10 @@ pub enum RegistryError {
         /// What does not match.
         source: crate::nn::NnError,
     },
+    /// The model cannot be computed on the chosen device.
+    #[doc(hidden)]
+    #[error(transparent)]
+    Device(crate::nn::NnError),
     /// The weights file is damaged.
     #[error("{} is not a valid safetensors file: {source}", path.display())]
     Safetensors {
@@ -100,7 +104,7 @@ impl HasErrorKind for RegistryError {
         }
         match self {
             Self::Unknown { .. } => ErrorKind::NotFound,
-            Self::Name(_) | Self::NotAModel(_) => ErrorKind::Usage,
+            Self::Name(_) | Self::NotAModel(_) | Self::Device(_) => ErrorKind::Usage,
             Self::Manifest { .. }
             | Self::ManifestValue { .. }
             | Self::Hash { .. }

@@ -48,13 +48,16 @@ pub struct StoredWeights {
 }
 
 /// Reads, verifies and builds the model in a directory. Errors: `Io`, `Manifest`, `ManifestValue`, `Hash`, `Safetensors`,
-/// `Weights`.
+/// `Weights`, `Device`.
 pub fn load(model_dir: &Path) -> Result<Model, RegistryError> {
     let StoredWeights { manifest, parameters } = load_weights(model_dir)?;
     let network = Network::detached(manifest.spec.clone(), &parameters).and_then(Network::packed);
-    let network = network.map_err(|source| RegistryError::Weights {
-        path: model_dir.join(WEIGHTS_FILE),
-        source,
+    let network = network.map_err(|source| match source {
+        NnError::Device { .. } => RegistryError::Device(source),
+        _ => RegistryError::Weights {
+            path: model_dir.join(WEIGHTS_FILE),
+            source,
+        },
     })?;
     Ok(Model {
         manifest: Arc::new(manifest),

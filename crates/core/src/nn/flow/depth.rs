@@ -94,7 +94,7 @@ impl FlowNetwork {
             first_depths_m,
             movers,
         } = if self.is_plain {
-            self.look_around_plainly(row, head)?
+            self.plain_look_around(row, head)?
         } else {
             self.look_around(row, head)?
         };

@@ -106,8 +106,7 @@ impl FlowNetwork {
         self.motion.wheels()
     }
 
-    /// Packs the weights of all layers as they are now, for fast prediction.
-    /// Those of plain tensor operations stay as they are.
+    /// Packs the weights of all layers as they are now, for fast prediction; plain tensor operations take them as they are.
     pub(in crate::nn) fn pack(&mut self) -> Result<(), NnError> {
         if self.is_plain {
             return Ok(());

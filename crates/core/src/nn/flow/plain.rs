@@ -2,13 +2,15 @@
 //! cards. All steps of all rollouts are computed together. Small things stay on the CPU: the wheels' integral and where the state says
 //! that the camera stands.
 //!
-//! Reading order: `cameras` → `depth_views`, `reprojection`, `depth` or `room`, `scene`, `direct`, `recurrent` → `composition`.
+//! Reading order: `cameras` and `motion` → `composition` → `depth_views`, `reprojection` and `depth`, or `room`, `scene`, `direct` and
+//! `recurrent`.
 
 mod cameras;
 mod composition;
 mod depth;
 mod depth_views;
 mod direct;
+mod motion;
 mod recurrent;
 mod reprojection;
 mod room;
@@ -28,7 +30,7 @@ use crate::nn::plain::layers::{linear_per_place, modulated_silu, perceptron, pix
 const ROWS_TOGETHER: usize = 128;
 
 /// What is known of the items: the first steps of rollouts, rollout after rollout. There are M.
-struct Ahead {
+struct ItemsAhead {
     /// How the camera will have moved since the last frame at all steps, `[N, horizon, 3]`.
     motion: Tensor,
     /// The same of the items, `[M, 3]`.
@@ -43,7 +45,7 @@ struct Ahead {
     shape: [usize; 2],
 }
 
-impl Ahead {
+impl ItemsAhead {
     /// The items' rows of something that there is for each context.
     fn of_contexts(&self, values: &Tensor) -> Result<Tensor, NnError> {
         let contexts = Tensor::new(self.context_of.as_slice(), values.device())?;
@@ -59,23 +61,23 @@ impl Ahead {
 
 impl FlowNetwork {
     /// As [`FlowNetwork::predict`]. Without gradients, the result is on the CPU.
-    pub(super) fn predict_plainly(&self, rows: &RolloutRows, steps: usize) -> Result<FlowPrediction, NnError> {
+    pub(super) fn plain_predict(&self, rows: &RolloutRows, steps: usize) -> Result<FlowPrediction, NnError> {
         if self.is_trained() {
-            return self.predict_rows_plainly(rows, steps);
+            return self.plain_predict_rows(rows, steps);
         }
         let first_rows = (0..rows.count()).step_by(ROWS_TOGETHER);
         let parts = first_rows.map(|first| first..(first + ROWS_TOGETHER).min(rows.count()));
-        let predict = |part: Range<usize>| self.predict_rows_plainly(&rows.part(part), steps)?.on_cpu();
+        let predict = |part: Range<usize>| self.plain_predict_rows(&rows.part(part), steps)?.on_cpu();
         FlowPrediction::joined(&parts.map(predict).collect::<Result<Vec<_>, NnError>>()?)
     }
 
-    fn predict_rows_plainly(&self, rows: &RolloutRows, steps: usize) -> Result<FlowPrediction, NnError> {
+    fn plain_predict_rows(&self, rows: &RolloutRows, steps: usize) -> Result<FlowPrediction, NnError> {
         match &self.surroundings {
-            Surroundings::Seen(depth) => self.predict_with_depth_plainly(rows, depth, steps),
+            Surroundings::Seen(depth) => self.plain_predict_with_depth(rows, depth, steps),
             Surroundings::Remembered(scene) if self.sizes.layers.recurrent => {
-                self.predict_recurrently_plainly(rows, scene, steps)
+                self.plain_predict_recurrently(rows, scene, steps)
             }
-            Surroundings::Remembered(scene) => self.predict_directly_plainly(rows, scene, steps),
+            Surroundings::Remembered(scene) => self.plain_predict_directly(rows, scene, steps),
         }
     }
 
@@ -84,13 +86,13 @@ impl FlowNetwork {
     }
 
     /// What is known of the first `steps` of the rollouts before their frames are computed.
-    fn ahead(&self, rows: &RolloutRows, steps: usize) -> Result<Ahead, NnError> {
+    fn ahead(&self, rows: &RolloutRows, steps: usize) -> Result<ItemsAhead, NnError> {
         let count = rows.count();
-        let motion = self.motion.forward_plainly(rows, self.device())?;
-        let modulation = self.modulate_plainly(rows, &motion)?;
+        let motion = self.motion.plain_forward(rows, self.device())?;
+        let modulation = self.plain_modulate(rows, &motion)?;
         let of_steps = |of_all: &Tensor| of_all.narrow(1, 0, steps)?.contiguous()?.flatten(0, 1);
         let contexts = rows.context_of().into_iter();
-        Ok(Ahead {
+        Ok(ItemsAhead {
             item_motion: of_steps(&motion)?,
             modulation: of_steps(&modulation)?,
             motion,
@@ -103,7 +105,7 @@ impl FlowNetwork {
     }
 
     /// Scales and shifts of the modulated layers `[N, horizon, …]`.
-    fn modulate_plainly(&self, rows: &RolloutRows, motion: &Tensor) -> Result<Tensor, NnError> {
+    fn plain_modulate(&self, rows: &RolloutRows, motion: &Tensor) -> Result<Tensor, NnError> {
         let mut inputs = rows.step_inputs()?.to_device(self.device())?;
         if self.motion.is_moving() {
             inputs = Tensor::cat(&[&inputs, &motion.flatten(0, 1)?], 1)?;
@@ -114,7 +116,7 @@ impl FlowNetwork {
 
     /// Features of each context `[contexts, C, H/4, W/4]` and those of the first layer `[contexts, …, H/2, W/2]`, from the encoder's
     /// inputs `[contexts, …, H/2, W/2]`.
-    fn encode_plainly(&self, inputs: &Tensor) -> Result<[Tensor; 2], NnError> {
+    fn plain_encode(&self, inputs: &Tensor) -> Result<[Tensor; 2], NnError> {
         let first = convolution(&self.stem, inputs)?.silu()?;
         let mut coarse = convolution(&self.halving, &first)?;
         for [before, after] in &self.blocks {
@@ -125,12 +127,12 @@ impl FlowNetwork {
     }
 
     /// The items' states `[M, C, H/4, W/4]` after the decoder's modulated blocks, from what they are mixed of.
-    fn state_plainly(&self, mixed: &Tensor, modulation: &Tensor) -> Result<Tensor, NnError> {
-        self.refined_plainly(linear_per_place(&self.mix, mixed)?, modulation)
+    fn plain_state(&self, mixed: &Tensor, modulation: &Tensor) -> Result<Tensor, NnError> {
+        self.plain_refined(linear_per_place(&self.mix, mixed)?, modulation)
     }
 
     /// The states after the modulated blocks.
-    fn refined_plainly(&self, mut state: Tensor, modulation: &Tensor) -> Result<Tensor, NnError> {
+    fn plain_refined(&self, mut state: Tensor, modulation: &Tensor) -> Result<Tensor, NnError> {
         let channels = self.sizes.layers.channels;
         for (index, [first, second]) in self.refine.iter().enumerate() {
             let modulation = |part: usize| modulation.narrow(1, (2 * index + part) * 2 * channels, 2 * channels);
@@ -141,7 +143,7 @@ impl FlowNetwork {
     }
 
     /// The head's values of each pixel `[M, HEAD_VALUES, P]` from the items' states and what else the fine layers read.
-    fn head_plainly(&self, state: &Tensor, moved: &Tensor, beside: &Tensor) -> Result<Tensor, NnError> {
+    fn plain_head(&self, state: &Tensor, moved: &Tensor, beside: &Tensor) -> Result<Tensor, NnError> {
         let enlarged = pixel_shuffle(&linear_per_place(&self.enlarge, &state.silu()?)?)?;
         let fine = convolution(&self.fine, &Tensor::cat(&[&enlarged, moved, beside], 1)?)?;
         Ok(pixel_shuffle(&convolution(&self.head, &fine.silu()?)?)?.flatten_from(2)?)

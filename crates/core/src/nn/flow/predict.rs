@@ -27,7 +27,7 @@ impl FlowNetwork {
     ) -> Result<FlowPrediction, NnError> {
         let rows = RolloutRows::new(&self.spec, frames, windows, conditioning)?;
         if self.is_plain {
-            return self.predict_plainly(&rows, steps);
+            return self.plain_predict(&rows, steps);
         }
         if self.is_trained() {
             return self.predict_rows(&rows, steps);

@@ -2,7 +2,7 @@
 
 use candle_core::Tensor;
 
-use super::Ahead;
+use super::ItemsAhead;
 use super::cameras::Cameras;
 use super::composition::moved_blocks;
 use super::depth_views::SeenViews;
@@ -26,7 +26,7 @@ struct SeenSteps {
     coarse: Tensor,
     /// Of each pixel of the contexts' last frames `[contexts, P]`, in metres.
     depths: Tensor,
-    ahead: Ahead,
+    ahead: ItemsAhead,
     /// Where the items' pixels were.
     seen: Reprojected,
     /// Column, row and inverse depth of each 2×2 block of the items.
@@ -36,7 +36,7 @@ struct SeenSteps {
 }
 
 impl FlowNetwork {
-    pub(super) fn predict_with_depth_plainly(
+    pub(super) fn plain_predict_with_depth(
         &self,
         rows: &RolloutRows,
         head: &DepthHead,
@@ -48,7 +48,7 @@ impl FlowNetwork {
         let last = ahead.of_contexts(&views.frames)?;
         let moved = moved_blocks(&last, size, &seen.places.room)?;
         let beside = beside_pixels(&steps.known, seen, size)?;
-        let head = self.head_plainly(&steps.state, &moved, &beside)?;
+        let head = self.plain_head(&steps.state, &moved, &beside)?;
         let frames = seen.places.compose(&last, size, &head, &last.zeros_like()?)?;
         let frames = frames
             .broadcast_mul(&ahead.of_contexts(&views.spread)?)?
@@ -56,20 +56,20 @@ impl FlowNetwork {
         Ok(FlowPrediction {
             frames: ahead.in_rows(&frames)?,
             scene: None,
-            movers: self.movers_plainly(&steps)?,
+            movers: self.plain_movers(&steps)?,
             motion: steps.ahead.motion,
         })
     }
 
     /// What stands around the robot of one rollout.
-    pub(in crate::nn::flow) fn look_around_plainly(
+    pub(in crate::nn::flow) fn plain_look_around(
         &self,
         row: &RolloutRows,
         head: &DepthHead,
     ) -> Result<SeenAround, NnError> {
         let steps = self.see_steps(row, head, self.spec.horizon)?;
         let values = |tensor: &Tensor| tensor.flatten_all()?.to_vec1::<f32>();
-        let movers = match self.movers_plainly(&steps)? {
+        let movers = match self.plain_movers(&steps)? {
             None => None,
             Some(logits) => Some(SeenMovers {
                 logits: values(&logits)?,
@@ -87,7 +87,7 @@ impl FlowNetwork {
         let size = self.spec.image_size();
         let contexts = rows.contexts(self.sizes.layers.frames_read);
         let views = SeenViews::of(&contexts, self.device())?;
-        let features = self.encode_plainly(&views.inputs)?;
+        let features = self.plain_encode(&views.inputs)?;
         let depths = (head.depth_factors(&features)? * &views.depths)?;
         let [coarse, _] = features;
         let ahead = self.ahead(rows, steps)?;
@@ -103,7 +103,7 @@ impl FlowNetwork {
         let is_seen = is_seen.reshape((is_seen.dim(0)?, 1, quarter.height, quarter.width))?;
         let mixed = Tensor::cat(&[warped, corners(&known, size.shrunk(2))?, is_seen], 1)?;
         Ok(SeenSteps {
-            state: self.state_plainly(&mixed, &ahead.modulation)?,
+            state: self.plain_state(&mixed, &ahead.modulation)?,
             views,
             coarse,
             depths,
@@ -115,7 +115,7 @@ impl FlowNetwork {
 
     /// Where movers are in the last frame and in the steps of each rollout, as logits `[N, 1 + steps, P]`; `None` if the model does not
     /// tell.
-    fn movers_plainly(&self, steps: &SeenSteps) -> Result<Option<Tensor>, NnError> {
+    fn plain_movers(&self, steps: &SeenSteps) -> Result<Option<Tensor>, NnError> {
         let Some(layers) = &self.movers else { return Ok(None) };
         let SeenSteps {
             coarse, ahead, state, ..

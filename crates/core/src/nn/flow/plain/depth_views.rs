@@ -57,7 +57,7 @@ impl SeenViews {
                 .broadcast_sub(&mean.unsqueeze(2)?)?
                 .broadcast_div(&spread.unsqueeze(2)?)?;
             let of_cameras = cameras.iter().flat_map(|camera| std::iter::repeat_n(*camera, earlier));
-            let viewed = Earlier {
+            let viewed = EarlierFrames {
                 cameras: Cameras::new(&of_cameras.collect::<Vec<_>>(), size, device)?,
                 size,
                 frames: seen.reshape(((), pixels))?,
@@ -108,7 +108,7 @@ pub(super) fn centred_places(size: ImageSize, count: usize, device: &Device) -> 
 }
 
 /// Earlier frames and what is needed to move them into the view of the last one.
-struct Earlier {
+struct EarlierFrames {
     cameras: Cameras,
     size: ImageSize,
     frames: Tensor,
@@ -116,7 +116,7 @@ struct Earlier {
     depths: Tensor,
 }
 
-impl Earlier {
+impl EarlierFrames {
     /// Blocks of the frames in the view of the last one (the last one's pixel where they saw nothing), and how far each block would
     /// shift if it were farther away. `motions`: yaw, ahead and left of each frame, as seen from the last one.
     fn moved_back(&self, motions: &[f32]) -> Result<[Tensor; 2]> {

@@ -2,7 +2,7 @@
 
 use candle_core::Tensor;
 
-use super::Ahead;
+use super::ItemsAhead;
 use super::cameras::Cameras;
 use super::composition::{MovedPlaces, blocks, moved_blocks};
 use super::depth_views::centred_places;
@@ -20,7 +20,7 @@ use crate::nn::plain::layers::{pixel_shuffle, pixel_unshuffle};
 use crate::nn::plain::sampling::{Places, sample, sample_features};
 
 impl FlowNetwork {
-    pub(super) fn predict_directly_plainly(
+    pub(super) fn plain_predict_directly(
         &self,
         rows: &RolloutRows,
         scene: &Scene,
@@ -29,7 +29,7 @@ impl FlowNetwork {
         let size = self.spec.image_size();
         let contexts = rows.contexts(self.sizes.layers.frames_read);
         let last = self.last_frames(&contexts)?;
-        let [coarse, _] = self.encode_plainly(&self.encoder_inputs(&contexts, &last, scene)?)?;
+        let [coarse, _] = self.plain_encode(&self.encoder_inputs(&contexts, &last, scene)?)?;
         // The scene's own loss is of all steps.
         let computed = if self.is_trained() { self.spec.horizon } else { steps };
         let ahead = self.ahead(rows, computed)?;
@@ -37,21 +37,21 @@ impl FlowNetwork {
         let poses: Vec<CameraPose> = ahead.row_of.iter().map(|&row| rows.pose(row)).collect();
         let before = self.room_poses(scene, &poses)?;
         let after = moved_poses(scene, before.as_ref(), &ahead.item_motion.detach())?;
-        let places = self.places_plainly(scene, &ahead, before.as_ref().zip(after.as_ref()))?;
+        let places = self.plain_places(scene, &ahead, before.as_ref().zip(after.as_ref()))?;
         let states = ahead.row_of.iter().map(|&row| rows.state(row));
         let views = SceneItems {
             states: self.scaled_states(states)?,
             motion: &ahead.item_motion,
             poses: after,
         };
-        let seen = scene.seen_plainly(&self.spec, &views)?;
-        let coarse_places = self.coarse_places_plainly(&ahead, &places)?;
+        let seen = scene.plain_seen(&self.spec, &views)?;
+        let coarse_places = self.plain_coarse_places(&ahead, &places)?;
         let warped = sample_features(&ahead.of_contexts(&coarse)?, &coarse_places)?;
         let features = pixel_unshuffle(&seen.narrow(1, 0, SCENE_FEATURES)?)?;
-        let state = self.state_plainly(&Tensor::cat(&[&warped, &features], 1)?, &ahead.modulation)?;
+        let state = self.plain_state(&Tensor::cat(&[&warped, &features], 1)?, &ahead.modulation)?;
         let last = ahead.of_contexts(&last)?;
         let moved = moved_blocks(&last, size, &places.room)?;
-        let head = self.head_plainly(&state, &moved, &seen)?;
+        let head = self.plain_head(&state, &moved, &seen)?;
         let content = pixel_shuffle(&content(&seen)?)?.flatten_from(1)?;
         let frames = places.compose(&last, size, &head, &content)?;
         Ok(FlowPrediction {
@@ -104,7 +104,7 @@ impl FlowNetwork {
             motion: &Tensor::zeros((count, 3), candle_core::DType::F32, device)?,
             poses: self.room_poses(scene, &contexts.poses)?,
         };
-        inputs.push(content(&scene.seen_plainly(&self.spec, &views)?)?.detach());
+        inputs.push(content(&scene.plain_seen(&self.spec, &views)?)?.detach());
         inputs.push(centred_places(size.shrunk(2), count, device)?);
         Ok(Tensor::cat(&inputs, 1)?)
     }
@@ -127,15 +127,15 @@ impl FlowNetwork {
     }
 
     /// Where each item's pixels were in the last frame.
-    fn places_plainly(
+    fn plain_places(
         &self,
         scene: &Scene,
-        ahead: &Ahead,
+        ahead: &ItemsAhead,
         poses: Option<(&RoomPoses, &RoomPoses)>,
     ) -> Result<MovedPlaces, NnError> {
         let (size, motion) = (self.spec.image_size(), &ahead.item_motion);
         let Some(camera) = self.sizes.camera.filter(|_| self.motion.is_moving()) else {
-            let turned = self.motion.affine_places_plainly(size, motion)?;
+            let turned = self.motion.plain_affine_places(size, motion)?;
             return Ok(MovedPlaces {
                 room: turned.clone(),
                 turned,
@@ -151,7 +151,7 @@ impl FlowNetwork {
     }
 
     /// The places before the turn on the grid of a quarter of the sides, without gradients.
-    fn coarse_places_plainly(&self, ahead: &Ahead, places: &MovedPlaces) -> Result<Places, NnError> {
+    fn plain_coarse_places(&self, ahead: &ItemsAhead, places: &MovedPlaces) -> Result<Places, NnError> {
         let size = self.spec.image_size();
         let motion = ahead.item_motion.detach();
         let Some(camera) = self.sizes.camera.filter(|_| self.motion.is_moving()) else {

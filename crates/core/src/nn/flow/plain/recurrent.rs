@@ -15,7 +15,7 @@ use crate::nn::plain::sampling::Places;
 
 impl FlowNetwork {
     /// The rollouts of a model that takes no actions: its camera stands. Only the first `steps` frames are computed.
-    pub(super) fn predict_recurrently_plainly(
+    pub(super) fn plain_predict_recurrently(
         &self,
         rows: &RolloutRows,
         scene: &Scene,
@@ -24,15 +24,15 @@ impl FlowNetwork {
         let (count, horizon, size) = (rows.count(), self.spec.horizon, self.spec.image_size());
         let contexts = rows.contexts(self.sizes.layers.frames_read);
         let last = self.last_frames(&contexts)?;
-        let [coarse, _] = self.encode_plainly(&self.encoder_inputs(&contexts, &last, scene)?)?;
+        let [coarse, _] = self.plain_encode(&self.encoder_inputs(&contexts, &last, scene)?)?;
         let once = self.ahead(rows, 1)?;
-        let modulation = self.modulate_plainly(rows, &once.motion)?;
+        let modulation = self.plain_modulate(rows, &once.motion)?;
         let views = SceneItems {
             states: self.scaled_states((0..count).map(|row| rows.state(row)))?,
             motion: &once.item_motion,
             poses: None,
         };
-        let seen = scene.seen_plainly(&self.spec, &views)?;
+        let seen = scene.plain_seen(&self.spec, &views)?;
         let features = pixel_unshuffle(&seen.narrow(1, 0, SCENE_FEATURES)?)?;
         let content = pixel_shuffle(&super::direct::content(&seen)?)?.flatten_from(1)?;
         let own = Places::own(size, self.device())?.of_items(count)?;
@@ -47,8 +47,8 @@ impl FlowNetwork {
             let shown = pixel_unshuffle(&moved.narrow(1, 0, BLOCK_PIXELS)?)?;
             let inputs = Tensor::cat(&[&state, &features, &shown], 1)?;
             state = (state + linear_per_place(&self.mix, &inputs)?)?;
-            state = self.refined_plainly(state, &modulation.narrow(1, step, 1)?.squeeze(1)?)?;
-            let head = self.head_plainly(&state, &moved, &seen)?;
+            state = self.plain_refined(state, &modulation.narrow(1, step, 1)?.squeeze(1)?)?;
+            let head = self.plain_head(&state, &moved, &seen)?;
             let frame = places.compose(&last, size, &head, &content)?;
             // Intensities end at black and white; what is beyond would grow from step to step.
             last = frame.detach().clamp(0f32, 1f32)?;

@@ -42,7 +42,7 @@ impl RoomPoses {
 }
 
 /// What rays meet.
-struct Met {
+struct RayHits {
     /// The points, in units of the room.
     points: Vectors,
     /// Directions of the rays.
@@ -53,7 +53,7 @@ struct Met {
     sides: Vec<Tensor>,
 }
 
-impl Met {
+impl RayHits {
     /// `parameter` `[6]` moves the sides.
     fn new(poses: &RoomPoses, rays: &Vectors, parameter: &Tensor) -> Result<Self> {
         let directions = rays.rotated(&poses.heading)?;
@@ -101,12 +101,12 @@ impl Met {
 
 /// What each ray of each view meets, described by `RAY_VALUES` numbers: `[M · K, RAY_VALUES]`. Gradients go to the sides.
 pub(super) fn describe(poses: &RoomPoses, cameras: &Cameras, parameter: &Tensor) -> Result<Tensor> {
-    let Met {
+    let RayHits {
         points,
         directions,
         times,
         sides,
-    } = Met::new(poses, &cameras.rays()?, parameter)?;
+    } = RayHits::new(poses, &cameras.rays()?, parameter)?;
     let mut values = Vec::new();
     for axis in [&points.ahead, &points.left, &points.up] {
         for octave in 0..OCTAVES {
@@ -140,7 +140,7 @@ pub(super) fn describe(poses: &RoomPoses, cameras: &Cameras, parameter: &Tensor)
 
 /// Where the views' pixels were seen from the poses before. Without gradients.
 pub(super) fn places_before([before, poses]: [&RoomPoses; 2], cameras: &Cameras, parameter: &Tensor) -> Result<Places> {
-    let met = Met::new(poses, &cameras.rays()?, &parameter.detach())?;
+    let met = RayHits::new(poses, &cameras.rays()?, &parameter.detach())?;
     let relative = met.points.moved(&before.x.neg()?, &before.y.neg()?)?;
     cameras.project(&relative.rotated(&before.heading.neg()?)?)
 }
