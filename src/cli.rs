@@ -4,6 +4,7 @@
 //! Subcommands do not use each other. What they share is, in the order in which it may use each other: `error`, `new_key`, `next_step`,
 //! `process` and `progress`, `interrupt`, `table`, `scores`, `settings`, `output`, `recorded`, `admin_address`, `workspace`.
 
+mod adapt;
 mod admin_address;
 mod backup;
 mod bridge;
@@ -72,6 +73,7 @@ enum Command {
     Collect(collect::CollectArgs),
     Import(import::ImportArgs),
     Train(train::TrainArgs),
+    Adapt(adapt::AdaptArgs),
     Evaluate(evaluate::EvaluateArgs),
     Calibrate(calibrate::CalibrateArgs),
     Predict(predict::PredictArgs),
@@ -128,6 +130,7 @@ fn run(command: Option<Command>) -> Result<(), CliError> {
         Command::Collect(args) => collect::run(&args),
         Command::Import(args) => import::run(args),
         Command::Train(args) => train::run(&args),
+        Command::Adapt(args) => adapt::run(&args),
         Command::Evaluate(args) => evaluate::run(&args),
         Command::Calibrate(args) => calibrate::run(&args),
         Command::Predict(args) => predict::run(&args),

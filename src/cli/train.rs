@@ -101,7 +101,7 @@ pub(super) fn run(args: &TrainArgs) -> Result<(), CliError> {
         directories.push(directory);
         weighted.push((dataset, *weight));
     }
-    let dataset = Dataset::join(weighted)?;
+    let dataset = Dataset::join(weighted, config.lacking())?;
     let run_dir = args
         .out
         .clone()
@@ -141,16 +141,16 @@ pub(super) fn run(args: &TrainArgs) -> Result<(), CliError> {
 }
 
 /// What all trainings of a command share.
-struct OneTraining<'a> {
-    dataset: &'a Dataset,
-    command: &'a str,
-    start: Option<&'a StoredWeights>,
-    cancelled: &'a AtomicBool,
+pub(super) struct OneTraining<'a> {
+    pub(super) dataset: &'a Dataset,
+    pub(super) command: &'a str,
+    pub(super) start: Option<&'a StoredWeights>,
+    pub(super) cancelled: &'a AtomicBool,
 }
 
 impl OneTraining<'_> {
     /// Trains and calibrates a model, or continues. Returns its directory and its description.
-    fn run(&self, config: &TrainConfig, run_dir: &Path) -> Result<(PathBuf, Box<Manifest>), CliError> {
+    pub(super) fn run(&self, config: &TrainConfig, run_dir: &Path) -> Result<(PathBuf, Box<Manifest>), CliError> {
         let training = Training {
             config,
             dataset: self.dataset,

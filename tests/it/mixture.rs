@@ -5,7 +5,7 @@ use serde_json::Value;
 use super::fixtures::moving_squares;
 use super::process::output;
 use foreframe_core::types::{Channel, Seed};
-use foreframe_data::dataset::{Dataset, DatasetInfo, EpisodeData, Split, Splits, WindowShape};
+use foreframe_data::dataset::{Dataset, DatasetInfo, EpisodeData, Lacking, Split, Splits, WindowShape};
 
 /// A data set of another name, whose episodes are those of the moving squares from `first` on, with changed description.
 fn part(name: &str, episodes: usize, change: impl FnOnce(&mut DatasetInfo)) -> Dataset {
@@ -39,7 +39,7 @@ fn part(name: &str, episodes: usize, change: impl FnOnce(&mut DatasetInfo)) -> D
 #[test]
 fn joined_data_sets_keep_their_frames_and_splits() {
     let (first, second) = (moving_squares(12, 12, 0.2), part("second", 20, |_| {}));
-    let joined = Dataset::join(vec![(first.clone(), 1.0), (second.clone(), 3.0)]).unwrap();
+    let joined = Dataset::join(vec![(first.clone(), 1.0), (second.clone(), 3.0)], Lacking::Refused).unwrap();
     assert_eq!(joined.info().name, "squares+second");
     assert_eq!(
         joined.parts().iter().map(|part| part.share).collect::<Vec<_>>(),
@@ -69,7 +69,10 @@ fn joined_data_sets_keep_their_frames_and_splits() {
 #[test]
 fn data_sets_that_do_not_fit_are_refused() {
     let refused = |other: Dataset, weight| {
-        let joined = Dataset::join(vec![(moving_squares(3, 12, 0.2), 1.0), (other, weight)]);
+        let joined = Dataset::join(
+            vec![(moving_squares(3, 12, 0.2), 1.0), (other, weight)],
+            Lacking::Refused,
+        );
         joined.unwrap_err().to_string()
     };
     let error = refused(moving_squares(3, 16, 0.2), 1.0);
@@ -93,7 +96,7 @@ fn data_sets_that_do_not_fit_are_refused() {
     assert!(error.contains("have the same content"), "{error}");
     let error = refused(part("light", 3, |_| {}), 0.0);
     assert!(error.contains("must be above 0"), "{error}");
-    assert!(Dataset::join(Vec::new()).is_err());
+    assert!(Dataset::join(Vec::new(), Lacking::Refused).is_err());
 }
 
 /// The settings of a training that takes a second.

@@ -37,6 +37,7 @@ pub use collect::{
 pub use error::DatasetError;
 pub use foreframe_sim::TrialParameters;
 pub use info::{DatasetInfo, DatasetPart, Episode, EpisodeData};
+pub use joined::Lacking;
 pub use opened::Dataset;
 pub use sampler::{Split, Splits, Window, WindowShape};
 pub use store::catalog::{find, is_finished, list};

@@ -7,6 +7,7 @@ pub mod actions;
 mod baselines;
 pub mod bootstrap;
 mod calibrate;
+mod camera_estimate;
 mod compatible;
 mod config;
 mod division;
@@ -41,6 +42,8 @@ mod windows;
 use std::time::Instant;
 
 pub use self::calibrate::{calibrate, calibrate_trained};
+#[doc(hidden)]
+pub use self::camera_estimate::{CameraEstimate, estimate_camera, window_errors, windows_of};
 pub use self::compatible::check_fit;
 pub use self::config::{EvaluateConfig, NEAREST_WINDOWS, ScoredSplit};
 #[doc(hidden)]

@@ -19,7 +19,8 @@ pub(super) struct ConditioningValues {
 }
 
 /// The conditioning inputs of a batch, in the units of the channels. An input that the model does not use is ignored; an
-/// input that the model needs but that is missing is an error.
+/// input that the model needs but that is missing is an error, unless the model sees how fast the camera drives
+/// ([`ModelSpec::sees_speeds`]): then it may be missing, and components that are not known are NaN.
 #[derive(Clone, Debug, Default)]
 pub struct ConditioningTensors {
     /// Future actions `[B, horizon, A]`; action k leads to predicted frame k.
@@ -59,7 +60,12 @@ impl ConditioningTensors {
     /// The inputs as plain values. Values far outside the training's are limited, so that no prediction is NaN. Errors:
     /// `Missing`, `Shape`.
     pub(super) fn values(&self, spec: &ModelSpec, batch: usize) -> Result<ConditioningValues, NnError> {
-        let [actions, states] = self.used(spec, batch)?;
+        let told = Self {
+            actions: self.actions.clone().or_else(|| spec.untold_actions(batch)),
+            state: self.state.clone().or_else(|| spec.untold_state(batch)),
+            ..Self::none()
+        };
+        let [actions, states] = told.used(spec, batch)?;
         let limited = |tensor: Option<&Tensor>, channels: &[ChannelScale]| -> Result<Vec<f32>, NnError> {
             let Some(tensor) = tensor else { return Ok(Vec::new()) };
             let values = tensor.flatten_all()?.to_vec1::<f32>()?.into_iter();
@@ -93,6 +99,20 @@ impl ConditioningTensors {
             .state_inputs()
             .map(|count| checked(spec, "state", self.state.as_ref(), &[batch, count]));
         Ok([actions.transpose()?, state.transpose()?])
+    }
+}
+
+impl ModelSpec {
+    /// Actions of which nothing is known, where the model can do without.
+    fn untold_actions(&self, batch: usize) -> Option<Tensor> {
+        let count = self.action_inputs().filter(|_| self.sees_speeds())?;
+        Tensor::full(f32::NAN, (batch, self.horizon, count), &Device::Cpu).ok()
+    }
+
+    /// States of which nothing is known, where the model can do without.
+    fn untold_state(&self, batch: usize) -> Option<Tensor> {
+        let count = self.state_inputs().filter(|_| self.sees_speeds())?;
+        Tensor::full(f32::NAN, (batch, count), &Device::Cpu).ok()
     }
 }
 

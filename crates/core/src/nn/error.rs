@@ -67,6 +67,9 @@ pub enum NnError {
     /// Only the depth form finds movers.
     #[error("model specification: flow.movers is true, but flow.depth is false; only the depth form finds movers")]
     MoversDepth,
+    /// Only the depth form sees how fast the camera drives.
+    #[error("model specification: flow.speeds is true, but flow.depth is false; only the depth form estimates speeds")]
+    SpeedsDepth,
     /// Two forms of the flow network at once.
     #[error("model specification: flow.recurrent and flow.depth are both true; a network has one of these forms")]
     RecurrentDepth,

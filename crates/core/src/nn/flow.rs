@@ -13,7 +13,7 @@
 //! camera saw each of its pixels.
 //!
 //! Reading order: `room_geometry` → `encoder_views` and `rollout_rows` (what the network reads) → `scene` and `motion`, or
-//! `depth_views`, `reprojection`, `depth_head`, `mover_head` and `occupancy` → `layers` (its tensors) → `network` → `direct`,
+//! `depth_views`, `reprojection`, `depth_head`, `speed_head`, `mover_head` and `occupancy` → `layers` (its tensors) → `network` → `direct`,
 //! `recurrent` and `depth` (its three forms) → `predict` → `beyond_horizon`. `plain` has the same in candle's own tensor operations.
 
 mod beyond_horizon;
@@ -35,6 +35,7 @@ mod reprojection;
 mod rollout_rows;
 mod room_geometry;
 mod scene;
+mod speed_head;
 mod steps_ahead;
 
 pub(super) use layers::{multiply_adds_per_frame, tensor_shapes};

@@ -203,7 +203,8 @@ impl Network {
             state.len() >= self.spec.state_inputs().unwrap_or(0),
             "a state without all its channels"
         );
-        let speeds = plans.map(|plan| channels.speeds(state, plan, count)).collect();
+        let measured = channels.measured_in(state);
+        let speeds = plans.map(|plan| channels.speeds(measured, plan, count)).collect();
         let learned = match &self.network {
             AnyNetwork::Dense(_) => None,
             AnyNetwork::Flow(flow) => flow.wheels(),

@@ -116,6 +116,7 @@ fn outputs(predicted: &FlowPrediction) -> Vec<Tensor> {
         predicted.scene.as_ref(),
         Some(&predicted.motion),
         predicted.movers.as_ref(),
+        predicted.speeds.as_ref(),
     ];
     given.into_iter().flatten().cloned().collect()
 }
@@ -289,6 +290,56 @@ fn the_form_that_estimates_depth_agrees() {
     assert_flow_agrees(layers, Some(camera()), Conditioning::StateAction);
     assert_flow_agrees(layers, None, Conditioning::Action);
     assert_occupancy_agrees(layers);
+}
+
+/// Inputs of which the first window tells nothing, the second its actions only, and the third everything.
+fn half_told(spec: &ModelSpec) -> ConditioningTensors {
+    let known = conditioning(spec);
+    let hidden = |tensor: Option<Tensor>, windows: usize| {
+        let tensor = tensor.unwrap();
+        let mut all = values(&tensor);
+        let each = all.len() / WINDOWS;
+        all[..windows * each].fill(f32::NAN);
+        Tensor::from_vec(all, tensor.dims(), &Device::Cpu).ok()
+    };
+    ConditioningTensors {
+        actions: hidden(known.actions, 1),
+        state: hidden(known.state, 2),
+        past_states: hidden(known.past_states, 2),
+        cameras: Vec::new(),
+    }
+}
+
+#[test]
+fn the_form_that_sees_speeds_agrees() {
+    let layers = FlowLayers {
+        depth: true,
+        movers: true,
+        speeds: true,
+        ..FlowLayers::default()
+    };
+    assert_flow_agrees(layers, Some(camera()), Conditioning::StateAction);
+    assert_flow_agrees(layers, Some(camera()), Conditioning::None);
+    let spec = spec(flow(layers, Some(camera())), Conditioning::StateAction);
+    assert_agreement(&spec, |network| {
+        let predicted = network.predict_flow(&frames(spec.context), &half_told(&spec), spec.horizon);
+        outputs(&predicted.unwrap().unwrap())
+    });
+    // Inputs that are missing count as not known.
+    let parameters = parameters(&spec);
+    let network = Network::detached(spec.clone(), &parameters).unwrap();
+    let nothing = |tensor: Option<Tensor>| tensor.map(|tensor| (tensor * f64::NAN).unwrap());
+    let told = conditioning(&spec);
+    let unknown = ConditioningTensors {
+        actions: nothing(told.actions),
+        state: nothing(told.state),
+        ..ConditioningTensors::none()
+    };
+    let [missing, unknown] = [ConditioningTensors::none(), unknown].map(|inputs| {
+        let predicted = network.predict_flow(&frames(spec.context), &inputs, spec.horizon);
+        predicted.unwrap().unwrap().frames
+    });
+    assert_eq!(values(&missing), values(&unknown));
 }
 
 #[test]

@@ -286,13 +286,14 @@ impl RolloutInContext<'_> {
         steps.map(|(step, inputs)| step.expected(inputs)).collect()
     }
 
-    /// Root mean square of the scaled actions up to a step; 0 without actions.
+    /// Root mean square of the scaled actions up to a step; 0 without actions, or if none is known.
     fn action_size(&self, step: usize) -> f64 {
         let scales = &self.spec.actions;
         let taken = (step + 1) * scales.len();
         let scaled = self.actions.iter().zip(scales.iter().cycle()).take(taken);
         let scaled = scaled.map(|(value, scale)| f64::from(scale.scaled(*value)));
-        let squares: Vec<f64> = scaled.map(|value| value.powi(2)).collect();
+        let known = scaled.filter(|value| value.is_finite());
+        let squares: Vec<f64> = known.map(|value| value.powi(2)).collect();
         (squares.iter().sum::<f64>() / squares.len().max(1) as f64).sqrt()
     }
 }

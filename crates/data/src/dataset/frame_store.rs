@@ -44,6 +44,7 @@ pub(super) struct JoinedStore {
     /// Its first frame among those of all.
     pub(super) first_frame: usize,
     pub(super) frame_count: usize,
+    pub(super) has_masks: bool,
     pub(super) images: FrameStore,
 }
 
@@ -60,6 +61,14 @@ impl FrameStore {
                 let masks = if is_mask { part.frame_count } else { 0 };
                 part.images.read(masks + frame - part.first_frame)
             }
+        }
+    }
+
+    /// Whether a frame has a mask, in a store of a data set with masks.
+    pub(super) fn has_mask(&self, frame: usize) -> bool {
+        match self {
+            Self::Memory(_) | Self::File(_) => true,
+            Self::Joined(parts) => parts[parts.partition_point(|part| part.first_frame <= frame) - 1].has_masks,
         }
     }
 

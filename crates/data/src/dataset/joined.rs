@@ -10,12 +10,21 @@ use foreframe_core::types::Channel;
 /// Frame periods may differ by this factor: cameras are not exact.
 const MAX_PERIOD_RATIO: f64 = 1.1;
 
+/// What becomes of a channel or of masks that a data set lacks.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Lacking {
+    /// A channel is refused; masks count only where all have them.
+    Refused,
+    /// The values are NaN, and masks count where there are some.
+    NotKnown,
+}
+
 impl Dataset {
     /// Joins data sets, each with its weight: the share of a part is its weight over the sum of all. Frame size, frame period
     /// and channels are those of the first. The channels of the others are found by name and unit; those that the first does
-    /// not have are left out, and masks unless all have them. One data set stays as it is. Errors: `Usage` if there is none, a
+    /// not have are left out. One data set stays as it is. Errors: `Usage` if there is none, a
     /// weight is not above 0, a data set occurs twice, or sizes, periods or channels do not fit.
-    pub fn join(mut weighted: Vec<(Self, f64)>) -> Result<Self, DatasetError> {
+    pub fn join(mut weighted: Vec<(Self, f64)>, lacking: Lacking) -> Result<Self, DatasetError> {
         check_weights(&weighted)?;
         if weighted.len() == 1 {
             return Ok(weighted.swap_remove(0).0);
@@ -29,12 +38,23 @@ impl Dataset {
         let mut content = FrameContent::default();
         let mut hasher = Sha256::new();
         for (dataset, weight) in weighted {
-            check_fit(&first, &dataset.info)?;
+            check_fit(&first, &dataset.info, lacking)?;
             let (from, first_frame) = (episodes.len(), content.timestamps_s.len());
             hasher.update(format!("{} {}\n", dataset.info.content_hash, weight / sum));
+            let frames = dataset.info.frame_count;
             content.append(FrameContent {
-                actions: reordered(&dataset.actions, &dataset.info.action_channels, &first.action_channels),
-                states: reordered(&dataset.states, &dataset.info.state_channels, &first.state_channels),
+                actions: reordered(
+                    &dataset.actions,
+                    frames,
+                    &dataset.info.action_channels,
+                    &first.action_channels,
+                ),
+                states: reordered(
+                    &dataset.states,
+                    frames,
+                    &dataset.info.state_channels,
+                    &first.state_channels,
+                ),
                 timestamps_s: dataset.timestamps_s,
                 ..FrameContent::default()
             });
@@ -46,6 +66,7 @@ impl Dataset {
             stores.push(JoinedStore {
                 first_frame,
                 frame_count: dataset.info.frame_count,
+                has_masks: dataset.info.has_masks,
                 images: dataset.images,
             });
             parts.push(DatasetPart {
@@ -57,7 +78,10 @@ impl Dataset {
         let names: Vec<&str> = parts.iter().map(|part| part.info.name.as_str()).collect();
         let info = DatasetInfo {
             name: names.join("+"),
-            has_masks: parts.iter().all(|part| part.info.has_masks),
+            has_masks: match lacking {
+                Lacking::Refused => parts.iter().all(|part| part.info.has_masks),
+                Lacking::NotKnown => parts.iter().any(|part| part.info.has_masks),
+            },
             camera: first
                 .camera
                 .filter(|camera| parts.iter().all(|part| part.info.camera == Some(*camera))),
@@ -103,7 +127,7 @@ fn check_weights(weighted: &[(Dataset, f64)]) -> Result<(), DatasetError> {
 }
 
 /// Errors: `Usage` if frames of `other` cannot stand beside those of `first`.
-fn check_fit(first: &DatasetInfo, other: &DatasetInfo) -> Result<(), DatasetError> {
+fn check_fit(first: &DatasetInfo, other: &DatasetInfo, lacking: Lacking) -> Result<(), DatasetError> {
     let size = |info: &DatasetInfo| format!("{}×{} px", info.frame_width_px, info.frame_height_px);
     if size(first) != size(other) {
         return Err(DatasetError::Usage(format!(
@@ -120,6 +144,9 @@ fn check_fit(first: &DatasetInfo, other: &DatasetInfo) -> Result<(), DatasetErro
             "\"{}\" has a frame every {} s, and \"{}\" every {} s; import or collect it with the same frame period",
             first.name, first.frame_period_s, other.name, other.frame_period_s
         )));
+    }
+    if lacking == Lacking::NotKnown {
+        return Ok(());
     }
     let kinds = [
         ("action", &first.action_channels, &other.action_channels),
@@ -148,14 +175,15 @@ fn place_of(channels: &[Channel], wanted: &Channel) -> Option<usize> {
     channels.iter().position(is_same)
 }
 
-/// The rows of `values`, whose channels are `found`, with the channels of `expected`.
-fn reordered(values: &[f32], found: &[Channel], expected: &[Channel]) -> Vec<f32> {
-    if expected.is_empty() {
-        return Vec::new();
-    }
-    let places: Vec<usize> = expected.iter().filter_map(|channel| place_of(found, channel)).collect();
-    values
-        .chunks_exact(found.len())
-        .flat_map(|row| places.iter().map(|&place| row[place]))
+/// The values of so many frames, whose channels are `found`, with the channels of `expected`; NaN for those that are not there.
+fn reordered(values: &[f32], frames: usize, found: &[Channel], expected: &[Channel]) -> Vec<f32> {
+    let places: Vec<Option<usize>> = expected.iter().map(|channel| place_of(found, channel)).collect();
+    let row = |frame: usize| &values[frame * found.len()..(frame + 1) * found.len()];
+    (0..frames)
+        .flat_map(|frame| {
+            places
+                .iter()
+                .map(move |place| place.map_or(f32::NAN, |place| row(frame)[place]))
+        })
         .collect()
 }

@@ -155,10 +155,23 @@ impl Dataset {
         self.info_of(episode).camera_of(trial)
     }
 
-    /// The camera of each of the episodes, given by position; empty unless all are known.
+    /// The same, taken by this camera where none is known.
+    #[doc(hidden)]
+    #[must_use]
+    pub fn with_camera(mut self, camera: CameraModel) -> Self {
+        self.info.camera = Some(camera);
+        self
+    }
+
+    /// The camera of each of the episodes, given by position; empty if none is known. Where only some are, the others are taken to
+    /// be the usual one.
     pub fn cameras(&self, episodes: impl IntoIterator<Item = usize>) -> Vec<CameraModel> {
-        let cameras = episodes.into_iter().map(|episode| self.camera(episode));
-        cameras.collect::<Option<_>>().unwrap_or_default()
+        let cameras: Vec<_> = episodes.into_iter().map(|episode| self.camera(episode)).collect();
+        if cameras.iter().all(Option::is_none) {
+            return Vec::new();
+        }
+        let known = cameras.into_iter().map(|camera| camera.unwrap_or(CameraModel::USUAL));
+        known.collect()
     }
 
     /// The intensities of a frame, row by row: borrowed from memory, or read from the file of decoded frames. Panics if there
@@ -167,11 +180,13 @@ impl Dataset {
         self.image(0, frame)
     }
 
-    /// The segmentation mask of a frame, if the data set has masks. Panics if there is no such frame. Errors: as
+    /// The segmentation mask of a frame, if there is one. Panics if there is no such frame. Errors: as
     /// [`Dataset::pixels`].
     pub fn mask(&self, frame: usize) -> Result<Option<Cow<'_, [u8]>>, DatasetError> {
         let mask = || self.image(self.info.frame_count, frame);
-        self.info.has_masks.then(mask).transpose()
+        (self.info.has_masks && self.images.has_mask(frame))
+            .then(mask)
+            .transpose()
     }
 
     /// The pixels of a frame, or of its mask if `first` is where the masks begin.

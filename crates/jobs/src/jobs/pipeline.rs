@@ -204,7 +204,8 @@ impl Pipeline {
         let opened = spec
             .datasets()
             .map(|(name, weight)| Ok((self.dataset(name, held_mib, &retry)?, weight)));
-        let dataset = Dataset::join(opened.collect::<Result<_, JobFailure>>()?).map_err(|error| failed(&error))?;
+        let opened = opened.collect::<Result<_, JobFailure>>()?;
+        let dataset = Dataset::join(opened, config.lacking()).map_err(|error| failed(&error))?;
         let training = Training {
             config: &config,
             dataset: &dataset,

@@ -46,7 +46,7 @@ pub fn check_fit(model: &Manifest, info: &DatasetInfo) -> Result<(), EvaluationE
     ];
     for (kind, used, wanted, found) in uses {
         let (wanted, found) = (comma_separated(wanted), comma_separated(found));
-        if used.is_some() && wanted != found {
+        if used.is_some() && wanted != found && !spec.sees_speeds() {
             return mismatch(format!("the {kind} [{found}]"), format!("takes [{wanted}]"));
         }
     }
@@ -56,6 +56,11 @@ pub fn check_fit(model: &Manifest, info: &DatasetInfo) -> Result<(), EvaluationE
 /// Whether the data set's states are those that the model takes.
 pub(super) fn has_states_of(spec: &ModelSpec, dataset: &Dataset) -> bool {
     spec.state_inputs().is_some() && comma_separated(&spec.states) == comma_separated(&dataset.info().state_channels)
+}
+
+/// Whether the data set's actions are those that the model takes.
+pub(super) fn has_actions_of(spec: &ModelSpec, dataset: &Dataset) -> bool {
+    spec.action_inputs().is_some() && comma_separated(&spec.actions) == comma_separated(&dataset.info().action_channels)
 }
 
 /// Errors: `TrainedOn` if the model was trained on this data set, so that it cannot be tested on all of it.

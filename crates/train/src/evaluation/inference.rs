@@ -6,6 +6,7 @@ use candle_core::{Device, Tensor};
 use rayon::prelude::*;
 
 use super::EvaluationError;
+use super::compatible::{has_actions_of, has_states_of};
 use super::windows::true_frame;
 use foreframe_core::frame::resize::{Resize, resize};
 use foreframe_core::frame::{Frame, quality};
@@ -171,12 +172,13 @@ impl<'a> Inference<'a> {
         future.zip(predicted.chunks_exact(spec.pixels())).map(error).collect()
     }
 
-    /// Action k of a window is the one recorded at the frame before its k-th predicted frame.
+    /// Action k of a window is the one recorded at the frame before its k-th predicted frame. Channels that the data set does not have
+    /// are left out: only a model that can do without takes such a data set.
     fn condition(&self, windows: &[Window], source: ActionSource) -> Result<ConditioningTensors, EvaluationError> {
         let (dataset, spec, batch) = (self.dataset, self.spec(), windows.len());
         let last = spec.context - 1;
         let mut condition = ConditioningTensors::none();
-        if let Some(count) = spec.action_inputs() {
+        if let Some(count) = spec.action_inputs().filter(|_| has_actions_of(spec, dataset)) {
             let mut actions = Vec::with_capacity(batch * spec.horizon * count);
             let acting = match source {
                 ActionSource::OfWindows(others) => others,
@@ -200,7 +202,7 @@ impl<'a> Inference<'a> {
             }
             condition.actions = Some(Tensor::from_vec(actions, (batch, spec.horizon, count), &Device::Cpu)?);
         }
-        if let Some(count) = spec.state_inputs() {
+        if let Some(count) = spec.state_inputs().filter(|_| has_states_of(spec, dataset)) {
             let states = windows.iter().map(|window| dataset.state(window.first_frame + last));
             let states = states.collect::<Vec<_>>().concat();
             condition.state = Some(Tensor::from_vec(states, (batch, count), &Device::Cpu)?);

@@ -20,6 +20,15 @@ enum Mirroring {
     Movers(Vec<u8>),
 }
 
+/// What a window hides from the network.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Hidden {
+    Nothing,
+    States,
+    /// States and actions.
+    All,
+}
+
 /// The kinds of channels.
 pub(super) const ACTION: usize = 0;
 pub(super) const STATE: usize = 1;
@@ -34,6 +43,8 @@ pub(super) struct Augmentation {
     brightness: f32,
     /// The largest share of each side that is cut off.
     crop: f32,
+    /// The share of windows that hide states or more.
+    hidden: f32,
     seed: Seed,
 }
 
@@ -74,6 +85,7 @@ pub(super) struct WindowChange {
     pub(super) gain: f32,
     /// The part that is seen, after mirroring; `None` for all of it.
     pub(super) part: Option<FramePart>,
+    pub(super) hidden: Hidden,
 }
 
 impl WindowChange {
@@ -84,6 +96,7 @@ impl WindowChange {
         is_reversed: false,
         gain: 1.0,
         part: None,
+        hidden: Hidden::Nothing,
     };
 
     /// Changes a frame's intensities, 0 to 1, row by row; `inverted` ones if the model inverts.
@@ -131,13 +144,19 @@ impl Augmentation {
             reverse: config.reverse,
             brightness: config.brightness as f32,
             crop: config.crop as f32,
+            hidden: config.hidden as f32,
             seed: seed.derive("augment", 0),
         })
     }
 
     /// The change of the window at this position of this step's batch.
     pub(super) fn draw(&self, step: usize, position: usize) -> WindowChange {
-        if self.mirror == Mirroring::Nothing && !self.reverse && self.brightness == 0.0 && self.crop == 0.0 {
+        if self.mirror == Mirroring::Nothing
+            && !self.reverse
+            && self.brightness == 0.0
+            && self.crop == 0.0
+            && self.hidden == 0.0
+        {
             return WindowChange::NONE;
         }
         let seed = self.seed.derive("step", step as u64).derive("window", position as u64);
@@ -152,8 +171,13 @@ impl Augmentation {
                 across: rng.random(),
                 down: rng.random(),
             }),
-            // Drawn last: whether it is set does not change what else is drawn.
+            // Drawn last: whether they are set does not change what else is drawn.
             is_reversed: self.reverse && rng.random::<bool>(),
+            hidden: match self.hidden > 0.0 && rng.random::<f32>() < self.hidden {
+                false => Hidden::Nothing,
+                true if rng.random::<bool>() => Hidden::States,
+                true => Hidden::All,
+            },
         }
     }
 
@@ -240,6 +264,7 @@ mod tests {
             reverse: false,
             brightness: 0.0,
             crop: 0.0,
+            hidden: 0.0,
             seed: Seed(1),
         };
         let changed = Augmentation {
@@ -274,6 +299,7 @@ mod tests {
             reverse: false,
             brightness: 0.0,
             crop: 0.0,
+            hidden: 0.0,
             seed: Seed(1),
         };
         // The first pixel is 30 brighter than the background and the third of the second row 4 darker.

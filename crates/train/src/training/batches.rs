@@ -4,7 +4,7 @@ use candle_core::{Device, Tensor};
 use rayon::prelude::*;
 
 use super::TrainError;
-use super::augment::{ACTION, Augmentation, STATE, WindowChange};
+use super::augment::{ACTION, Augmentation, Hidden, STATE, WindowChange};
 use super::config::Target;
 use foreframe_core::frame::preprocess::Preprocess;
 use foreframe_core::nn::ConditioningTensors;
@@ -57,7 +57,10 @@ pub(super) struct WindowBatch {
     pub(super) condition: ConditioningTensors,
     /// The states at the targets `[B, horizon, S]`, where the data set has states.
     pub(super) future_states: Option<Tensor>,
-    /// Where movers are in the last context frame and in the targets `[B, 1 + horizon, P]`, where the data set has masks.
+    /// The state at the last context frame `[B, S]`, also where the network is not told.
+    pub(super) measured: Option<Tensor>,
+    /// Where movers are in the last context frame and in the targets `[B, 1 + horizon, P]`, where the data set has masks; NaN for
+    /// windows of which no masks are known.
     pub(super) movers: Option<Tensor>,
 }
 
@@ -129,7 +132,7 @@ impl<'a> FrameSource<'a> {
         Ok(Tensor::from_vec(values, (frames.len(), pixels), &Device::Cpu)?)
     }
 
-    /// Whether each pixel of the frames belongs to a mover `[N, P]`, 0 or 1; `None` without masks.
+    /// Whether each pixel of the frames belongs to a mover `[N, P]`, 0 or 1, or NaN for a frame without a mask; `None` without masks.
     fn masks(&self, frames: &[(usize, WindowChange)]) -> Result<Option<Tensor>, TrainError> {
         let info = self.dataset.info();
         if !(info.has_masks && self.reads_masks) {
@@ -137,10 +140,11 @@ impl<'a> FrameSource<'a> {
         }
         let mut values = Vec::with_capacity(frames.len() * info.frame_pixels());
         for &(frame, change) in frames {
-            let Some(mask) = self.dataset.mask(frame)? else {
-                return Ok(None);
-            };
             let from = values.len();
+            let Some(mask) = self.dataset.mask(frame)? else {
+                values.resize(from + info.frame_pixels(), f32::NAN);
+                continue;
+            };
             values.extend(mask.iter().map(|&robot| f32::from(u8::from(robot != 0))));
             let change = WindowChange { gain: 1.0, ..change };
             change.apply(&mut values[from..], info.frame_width_px as usize, false);
@@ -175,18 +179,27 @@ impl<'a> FrameSource<'a> {
         let (acting, last, earlier) = (span(context - 1, horizon), span(context - 1, 1), span(0, context - 1));
         let batched = |frames: Tensor, length: usize| frames.reshape((windows.len(), length, ()));
         let future_inputs = with_future.then(|| inputs(&future)).transpose()?;
+        let told = |hides: fn(Hidden) -> bool, values: Option<Tensor>| told(windows, hides, values);
+        let measured = self.channels(STATE, &last, &[windows.len()])?;
         Ok(WindowBatch {
             inputs: batched(inputs(&past)?, context)?,
             input_targets: batched(targets(&past)?, context)?,
             future: future_inputs.map(|frames| batched(frames, horizon)).transpose()?,
             targets: batched(targets(&future)?, horizon)?,
             condition: ConditioningTensors {
-                actions: self.channels(ACTION, &acting, &[windows.len(), horizon])?,
-                state: self.channels(STATE, &last, &[windows.len()])?,
-                past_states: self.channels(STATE, &earlier, &[windows.len(), context - 1])?,
+                actions: told(
+                    |hidden| hidden == Hidden::All,
+                    self.channels(ACTION, &acting, &[windows.len(), horizon])?,
+                )?,
+                state: told(|hidden| hidden != Hidden::Nothing, measured.clone())?,
+                past_states: told(
+                    |hidden| hidden != Hidden::Nothing,
+                    self.channels(STATE, &earlier, &[windows.len(), context - 1])?,
+                )?,
                 cameras: self.dataset.cameras(windows.iter().map(|drawn| drawn.window.episode)),
             },
             future_states: self.channels(STATE, &future, &[windows.len(), horizon])?,
+            measured,
             movers: self
                 .masks(&span(context - 1, 1 + horizon))?
                 .map(|masks| batched(masks, 1 + horizon))
@@ -219,6 +232,31 @@ impl<'a> FrameSource<'a> {
         }
         let shape = [shape, &[values.len() / frames.len()]].concat();
         Ok(Some(Tensor::from_vec(values, shape, &Device::Cpu)?))
+    }
+}
+
+/// Values of each window, NaN for the windows that hide them.
+fn told(
+    windows: &[DrawnWindow<'_>],
+    hides: fn(Hidden) -> bool,
+    values: Option<Tensor>,
+) -> Result<Option<Tensor>, TrainError> {
+    let is_hidden = |drawn: &DrawnWindow| hides(drawn.change.hidden);
+    match values {
+        Some(values) if windows.iter().any(is_hidden) => {
+            let shape = values.shape().clone();
+            let mut all = values.flatten_all()?.to_vec1::<f32>()?;
+            let each = all.len() / windows.len();
+            for (values, _) in all
+                .chunks_exact_mut(each)
+                .zip(windows)
+                .filter(|(_, drawn)| is_hidden(drawn))
+            {
+                values.fill(f32::NAN);
+            }
+            Ok(Some(Tensor::from_vec(all, shape, &Device::Cpu)?))
+        }
+        values => Ok(values),
     }
 }
 

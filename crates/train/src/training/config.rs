@@ -14,7 +14,7 @@ use foreframe_core::frame::warp::CameraModel;
 use foreframe_core::nn::loss::Loss;
 use foreframe_core::nn::{Architecture, ChannelScale, FlowSpec, ModelSpec};
 use foreframe_core::types::{Channel, ModelName, Seed};
-use foreframe_data::dataset::{Dataset, sampler::WindowShape};
+use foreframe_data::dataset::{Dataset, Lacking, sampler::WindowShape};
 
 /// All settings of a training. Together with the data set, they determine the weights.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -64,6 +64,10 @@ pub struct DataConfig {
     /// data sets without a camera model.
     #[serde(default)]
     pub crop: f64,
+    /// The share of training windows that hide their states, half of them their actions too, 0 to 1. Only for networks that see how
+    /// fast the camera drives (`model.flow.speeds`).
+    #[serde(default)]
+    pub hidden: f64,
     /// Whether a model may be conditioned on actions that never change in the training windows.
     #[serde(default)]
     pub constant_actions: bool,
@@ -159,6 +163,10 @@ pub struct SequenceConfig {
     /// Weight of the loss of movers (flow network with `movers`): the cross entropy of where they are and will be.
     #[serde(default)]
     pub movers_weight: f64,
+    /// Weight of the loss of speeds (flow network with `speeds`): the difference between the speeds that the frames show and those
+    /// in the states, in m/s and rad/s.
+    #[serde(default)]
+    pub speeds_weight: f64,
 }
 
 impl SequenceConfig {
@@ -251,6 +259,22 @@ impl TrainConfig {
         }
     }
 
+    /// Whether the network sees in the frames how fast the camera drives, so that states and actions may be missing.
+    #[must_use]
+    pub fn sees_speeds(&self) -> bool {
+        matches!(self.model.architecture, ArchitectureConfig::Flow(layers) if layers.speeds)
+    }
+
+    /// What becomes of channels and masks that one of several data sets lacks.
+    #[must_use]
+    pub fn lacking(&self) -> Lacking {
+        if self.sees_speeds() {
+            Lacking::NotKnown
+        } else {
+            Lacking::Refused
+        }
+    }
+
     /// Context and horizon of a window.
     #[must_use]
     pub fn window_shape(&self) -> WindowShape {
@@ -307,23 +331,25 @@ fn mean_camera(dataset: &Dataset) -> Option<CameraModel> {
     })
 }
 
-/// Mean and standard deviation of each channel over the frames.
+/// Mean and standard deviation of each channel over the frames of which it is known.
 fn scales<'a>(channels: &[Channel], frames: &[usize], values: impl Fn(usize) -> &'a [f32]) -> Vec<ChannelScale> {
-    let count = frames.len().max(1) as f64;
-    let moment = |index: usize, power: i32, mean: f64| {
-        frames
-            .iter()
-            .map(|&frame| (f64::from(values(frame)[index]) - mean).powi(power))
-            .sum::<f64>()
-            / count
+    // Of joined data sets, one may lack a channel.
+    let known = |index: usize| -> Vec<f64> {
+        let all = frames.iter().map(|&frame| f64::from(values(frame)[index]));
+        all.filter(|value| value.is_finite()).collect()
+    };
+    let moment = |known: &[f64], power: i32, mean: f64| {
+        let sum: f64 = known.iter().map(|value| (value - mean).powi(power)).sum();
+        sum / known.len().max(1) as f64
     };
     let scale = |(index, channel): (usize, &Channel)| {
-        let mean = moment(index, 1, 0.0);
+        let known = known(index);
+        let mean = moment(&known, 1, 0.0);
         ChannelScale {
             name: channel.name.clone(),
             unit: channel.unit.clone(),
             mean: mean as f32,
-            std: (moment(index, 2, mean).sqrt() as f32).max(1e-3),
+            std: (moment(&known, 2, mean).sqrt() as f32).max(1e-3),
         }
     };
     channels.iter().enumerate().map(scale).collect()

@@ -13,7 +13,7 @@ use foreframe_core::frame::Frame;
 use foreframe_core::nn::loss::Loss;
 use foreframe_core::nn::mask_loss::mask_loss;
 use foreframe_core::nn::ssim_loss::ssim_loss;
-use foreframe_core::nn::{Feedback, Network, Parameters};
+use foreframe_core::nn::{Feedback, Network, NnError, Parameters};
 
 /// Prefix of the names of the codec's tensors.
 const CODEC_PREFIX: &str = "frame_";
@@ -68,15 +68,27 @@ impl<'a> SequenceObjective<'a> {
             loss = (loss + (scene * sequence.scene_weight)?)?;
         }
         if sequence.motion_weight > 0.0
-            && let (Some(state), Some(future)) = (&batch.condition.state, &batch.future_states)
+            && let (Some(state), Some(future)) = (&batch.measured, &batch.future_states)
             && let Some(truth) = self.plan.spec.measured_motion(state, future)?
         {
-            let motion = Loss::Mse.between(&predicted.motion, &truth)?;
-            loss = (loss + (motion * sequence.motion_weight)?)?;
+            loss = added(
+                loss,
+                sequence.motion_weight,
+                &predicted.motion,
+                &truth,
+                |found, truth| Loss::Mse.between(found, truth),
+            )?;
         }
         if let (Some(movers), Some(truth)) = (&predicted.movers, &batch.movers) {
             let truth = truth.narrow(1, 0, 1 + counting)?.contiguous()?;
-            loss = (loss + (mask_loss(movers, &truth)? * sequence.movers_weight)?)?;
+            loss = added(loss, sequence.movers_weight, movers, &truth, mask_loss)?;
+        }
+        if let (Some(speeds), Some(state)) = (&predicted.speeds, &batch.measured)
+            && let Some(truth) = self.plan.spec.measured_speeds(state)?
+        {
+            loss = added(loss, sequence.speeds_weight, speeds, &truth, |found, truth| {
+                Loss::Mse.between(found, truth)
+            })?;
         }
         Ok(loss)
     }
@@ -104,6 +116,31 @@ impl<'a> SequenceObjective<'a> {
         };
         self.plan.mixture.iter().map(of_part).collect()
     }
+}
+
+/// The loss with another one, which counts those windows whose truth is known, that is nowhere NaN.
+fn added(
+    loss: Tensor,
+    weight: f64,
+    found: &Tensor,
+    truth: &Tensor,
+    between: impl Fn(&Tensor, &Tensor) -> Result<Tensor, NnError>,
+) -> Result<Tensor, TrainError> {
+    let windows = truth.dim(0)?;
+    let each = truth.elem_count() / windows;
+    let values = truth.flatten_all()?.to_vec1::<f32>()?;
+    let rows = (0..windows as u32).zip(values.chunks_exact(each));
+    let known = rows.filter(|(_, values)| !values.iter().any(|value| value.is_nan()));
+    let known: Vec<u32> = known.map(|(window, _)| window).collect();
+    if known.is_empty() || weight == 0.0 {
+        return Ok(loss);
+    }
+    if known.len() == windows {
+        return Ok((loss + (between(found, truth)? * weight)?)?);
+    }
+    let share = known.len() as f64 / windows as f64;
+    let of = |values: &Tensor| values.index_select(&Tensor::new(known.as_slice(), values.device())?, 0);
+    Ok((loss + (between(&of(found)?, &of(truth)?)? * (weight * share))?)?)
 }
 
 impl Objective for SequenceObjective<'_> {

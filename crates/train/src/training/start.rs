@@ -1,20 +1,70 @@
 //! Fine-tuning: a training that starts from the weights of another model.
 
+use std::collections::BTreeMap;
+
+use candle_core::{Device, Tensor};
+
 use super::TrainError;
 use super::plan::TrainingPlan;
 use foreframe_core::error_text::comma_separated;
-use foreframe_core::nn::Parameters;
+use foreframe_core::nn::{ModelSpec, Parameters};
 use foreframe_core::registry::StoredWeights;
 use foreframe_core::types::Seed;
 
-/// Prefix of the names of the tensors that find movers.
-const MOVERS_PREFIX: &str = "flow.movers.";
+/// Prefixes of the names of tensors that a network may have and the one before it not.
+const OPTIONAL_PREFIXES: [&str; 3] = ["flow.movers.", "flow.speeds.", "flow.motion."];
 
-/// The weights of another model; if only this training's network finds movers, what finds them starts at random, and if only
-/// the other one does, that is left out.
+/// The weights of another model. What only this training's network has, of movers, speeds and motion, starts at random, and what
+/// only the other one has of them is left out. If this network sees how fast the camera drives, states and actions may be others
+/// too: the weights of those that both have stay, and those of new ones start at 0.
 /// Errors: `OtherNetwork` if they do not fit this training's network, `OtherUnits`.
 pub(super) fn parameters(plan: &TrainingPlan<'_>, start: &StoredWeights, seed: Seed) -> Result<Parameters, TrainError> {
     let (from, to) = (&start.manifest.spec, &plan.spec);
+    let fits = check_channels(start, to);
+    let mut tensors = start.parameters.snapshot()?;
+    if to.flow().is_some() && from.flow().is_some() {
+        let is_optional = |name: &str| OPTIONAL_PREFIXES.iter().any(|prefix| name.starts_with(prefix));
+        let initial = Parameters::initialize(to, seed)?.snapshot()?;
+        tensors.retain(|name, _| !is_optional(name) || initial.contains_key(name));
+        let is_new = |name: &str| is_optional(name) && !tensors.contains_key(name);
+        let new: Vec<_> = initial.into_iter().filter(|(name, _)| is_new(name)).collect();
+        tensors.extend(new);
+    }
+    let (before, after) = (from.rows_of_inputs(), to.rows_of_inputs());
+    let rows = |rows: &BTreeMap<String, Vec<String>>| rows.values().map(Vec::len).collect::<Vec<_>>();
+    if to.sees_speeds() && (fits.is_err() || rows(&before) != rows(&after)) {
+        for (name, wanted) in &after {
+            if let (Some(found), Some(tensor)) = (before.get(name), tensors.get_mut(name)) {
+                *tensor = rearranged(tensor, found, wanted)?;
+            }
+        }
+    } else {
+        fits?;
+    }
+    Parameters::from_tensors(&plan.spec, tensors).map_err(|source| TrainError::OtherNetwork {
+        model: start.manifest.name.clone(),
+        source,
+    })
+}
+
+/// The rows of a matrix whose rows are `found`, as `wanted`: 0 where there was none.
+fn rearranged(matrix: &Tensor, found: &[String], wanted: &[String]) -> Result<Tensor, TrainError> {
+    let columns = matrix.dim(1)?;
+    let values = matrix.flatten_all()?.to_vec1::<f32>()?;
+    let row = |name: &String| {
+        let place = found.iter().position(|other| other == name);
+        place.map_or_else(
+            || vec![0.0; columns],
+            |place| values[place * columns..(place + 1) * columns].to_vec(),
+        )
+    };
+    let rows: Vec<f32> = wanted.iter().flat_map(row).collect();
+    Ok(Tensor::from_vec(rows, (wanted.len(), columns), &Device::Cpu)?)
+}
+
+/// Errors: `OtherUnits` if the channels that this training's network takes are not those of the other one.
+fn check_channels(start: &StoredWeights, to: &ModelSpec) -> Result<(), TrainError> {
+    let from = &start.manifest.spec;
     let used = [
         ("action", to.action_inputs(), &from.actions, &to.actions),
         ("state", to.state_inputs(), &from.states, &to.states),
@@ -38,18 +88,5 @@ pub(super) fn parameters(plan: &TrainingPlan<'_>, start: &StoredWeights, seed: S
             });
         }
     }
-    let mut tensors = start.parameters.snapshot()?;
-    if let (Some(from), Some(to)) = (from.flow(), to.flow())
-        && to.layers.movers != from.layers.movers
-    {
-        tensors.retain(|name, _| !name.starts_with(MOVERS_PREFIX));
-        if to.layers.movers {
-            let initial = Parameters::initialize(&plan.spec, seed)?.snapshot()?;
-            tensors.extend(initial.into_iter().filter(|(name, _)| name.starts_with(MOVERS_PREFIX)));
-        }
-    }
-    Parameters::from_tensors(&plan.spec, tensors).map_err(|source| TrainError::OtherNetwork {
-        model: start.manifest.name.clone(),
-        source,
-    })
+    Ok(())
 }

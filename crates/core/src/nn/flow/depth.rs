@@ -72,7 +72,7 @@ impl FlowNetwork {
             return Ok(None);
         };
         let windows: Vec<u32> = (0..frames.dim(0)? as u32).collect();
-        let rows = RolloutRows::new(&self.spec, frames, &windows, conditioning)?;
+        let rows = self.see_speeds(&RolloutRows::new(&self.spec, frames, &windows, conditioning)?)?;
         let all = windows.iter().map(|&window| {
             let window = window as usize;
             self.occupancy_of(&rows.part(window..window + 1), head)

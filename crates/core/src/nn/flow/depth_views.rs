@@ -91,21 +91,21 @@ impl DepthViews {
 }
 
 /// Mean and spread of a frame.
-fn levels(frame: &[f32]) -> [f32; 2] {
+pub(super) fn levels(frame: &[f32]) -> [f32; 2] {
     let count = frame.len() as f32;
     let mean = frame.iter().sum::<f32>() / count;
     let variance = frame.iter().map(|value| (value - mean).powi(2)).sum::<f32>() / count;
     [mean, variance.sqrt().max(MIN_SPREAD)]
 }
 
-fn count_from(frame: &mut [f32], [mean, spread]: [f32; 2]) {
+pub(super) fn count_from(frame: &mut [f32], [mean, spread]: [f32; 2]) {
     for value in frame {
         *value = (*value - mean) / spread;
     }
 }
 
 /// The depth of each pixel, in metres, if there were only the floor and a wall around the camera.
-fn depths_before_learning(viewer: Viewer, height_m: f32) -> Vec<f32> {
+pub(super) fn depths_before_learning(viewer: Viewer, height_m: f32) -> Vec<f32> {
     let depth = |[ahead, left, up]: [f32; 3]| {
         let wall = WALL_M / ahead.hypot(left).max(1e-3);
         if up < 0.0 { wall.min(height_m / -up) } else { wall }
@@ -114,7 +114,7 @@ fn depths_before_learning(viewer: Viewer, height_m: f32) -> Vec<f32> {
 }
 
 /// Column, row and inverse depth of each 2×2 block.
-fn known(size: ImageSize, depths: &[f32]) -> Vec<f32> {
+pub(super) fn known(size: ImageSize, depths: &[f32]) -> Vec<f32> {
     let half = size.shrunk(2);
     let mut known = Vec::with_capacity(half.pixels() * KNOWN_VALUES);
     for row in 0..half.height {
@@ -163,12 +163,12 @@ fn moved_back(
 
 /// What a pixel's shift adds to the mean of its block's four.
 #[inline(always)]
-fn shift(pixels: f32) -> f32 {
+pub(super) fn shift(pixels: f32) -> f32 {
     (pixels / SHIFT_PX).clamp(-MAX_SHIFT, MAX_SHIFT) / 4.0
 }
 
 /// Writes each 2×2 block of a frame to four channels of its place, from channel `first` on.
-fn put_blocks(frame: &[f32], size: ImageSize, out: &mut [f32], first: usize) {
+pub(super) fn put_blocks(frame: &[f32], size: ImageSize, out: &mut [f32], first: usize) {
     let half = size.shrunk(2);
     let channels = out.len() / half.pixels();
     for (pixel, value) in frame.iter().enumerate() {
@@ -179,7 +179,7 @@ fn put_blocks(frame: &[f32], size: ImageSize, out: &mut [f32], first: usize) {
 }
 
 /// Writes `each` values of each place to its channels from `first` on.
-fn put(values: &[f32], each: usize, out: &mut [f32], first: usize) {
+pub(super) fn put(values: &[f32], each: usize, out: &mut [f32], first: usize) {
     let places = values.chunks_exact(each);
     let channels = out.len() / places.len();
     for (out, values) in out.chunks_exact_mut(channels).zip(places) {

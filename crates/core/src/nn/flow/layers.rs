@@ -8,6 +8,7 @@ use super::depth_views::DepthViews;
 use super::encoder_views::EncoderViews;
 use super::motion::{MOTION_HIDDEN, WHEELS};
 use super::scene::SceneKind;
+use super::speed_head::{SPEED_CHANNELS, VOTE_VALUES, speed_channels};
 use crate::nn::geometry::state_channels::StateChannels;
 use crate::nn::ops::compose::{HEAD_VALUES, SCENE_CHANNELS, SCENE_FEATURES};
 use crate::nn::ops::image_geometry::TAPS;
@@ -45,6 +46,35 @@ pub(in crate::nn) fn tensor_shapes(spec: &ModelSpec, flow: &FlowSpec) -> BTreeMa
         shapes.insert(scene.tensor_name().to_owned(), shape);
     }
     shapes
+}
+
+impl ModelSpec {
+    /// What each row of the weights that read states and actions stands for, by tensor; empty for other networks.
+    #[doc(hidden)]
+    #[must_use]
+    pub fn rows_of_inputs(&self) -> BTreeMap<String, Vec<String>> {
+        let Some(flow) = self.flow() else {
+            return BTreeMap::new();
+        };
+        let states = self.states_read_by_layers().into_iter();
+        let states = states.map(|channel| format!("state {}", self.states[channel]));
+        let actions = self.action_inputs().map_or(&[][..], |_| &self.actions);
+        let actions = (0..self.horizon).flat_map(|step| actions.iter().map(move |action| format!("{step} {action}")));
+        let known: Vec<String> = states.chain(actions).collect();
+        let steps = (0..self.horizon).map(|step| format!("step {step}"));
+        let motion = if self.action_inputs().is_some() || flow.layers.speeds {
+            &["yaw", "ahead", "left"][..]
+        } else {
+            &[]
+        };
+        let told = known.iter().cloned().chain(steps);
+        let told = told.chain(motion.iter().map(|part| (*part).to_owned())).collect();
+        let mut rows = BTreeMap::from([("flow.modulation.inputs.weight".to_owned(), told)]);
+        if self.action_inputs().is_some() {
+            rows.insert("flow.motion.inputs.weight".to_owned(), known);
+        }
+        rows
+    }
 }
 
 /// Multiply–adds of weights to predict a window's frames, per frame, rounded up.
@@ -111,7 +141,24 @@ fn layer_sizes(spec: &ModelSpec, flow: &FlowSpec) -> Vec<LayerSize> {
             layer("affine", 3, 6, horizon);
         }
     }
-    let moving = if actions.is_some() { 3 } else { 0 };
+    if sizes.speeds {
+        layer(
+            "speeds.halving",
+            TAPS * speed_channels(sizes.frames_read),
+            SPEED_CHANNELS,
+            quarter,
+        );
+        for index in 0..2 {
+            layer(
+                &format!("speeds.{index}"),
+                TAPS * SPEED_CHANNELS,
+                SPEED_CHANNELS,
+                quarter,
+            );
+        }
+        layer("speeds.votes", SPEED_CHANNELS, VOTE_VALUES, quarter);
+    }
+    let moving = if actions.is_some() || sizes.speeds { 3 } else { 0 };
     let told = known + horizon + moving;
     layer("modulation.inputs", told, MODULATION_HIDDEN, horizon);
     let modulated = (2 * sizes.decoder_blocks).max(1) * 2 * channels;

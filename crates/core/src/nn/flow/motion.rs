@@ -30,6 +30,8 @@ pub(super) struct MotionHead {
     /// What was learned of the wheels; `None` where no speeds are commanded.
     pub(super) wheels: Option<Tensor>,
     pub(super) affine: Option<Linear>,
+    /// Whether the frames show how fast the camera drives where nothing else tells.
+    sees_speeds: bool,
 }
 
 impl MotionHead {
@@ -39,6 +41,7 @@ impl MotionHead {
         Self {
             layers: is_moving.then(layers),
             wheels: (StateChannels::of(spec).commands_speeds()).then(|| tensors.tensor(WHEELS)),
+            sees_speeds: sizes.layers.speeds,
             affine: (is_moving && sizes.camera.is_none() && !sizes.layers.depth).then(|| tensors.linear("flow.affine")),
         }
     }
@@ -58,7 +61,7 @@ impl MotionHead {
 
     /// Whether anything says how the camera moves.
     pub(super) fn is_moving(&self) -> bool {
-        self.layers.is_some()
+        self.layers.is_some() || self.sees_speeds
     }
 
     /// Yaw, ahead and left since the last frame `[N, horizon, 3]`; zero for a standing camera.
@@ -66,10 +69,22 @@ impl MotionHead {
         let spec = rows.spec;
         let shape = (rows.count(), spec.horizon, 3);
         let Some(layers) = &self.layers else {
-            return Ok(Tensor::zeros(shape, DType::F32, &Device::Cpu)?);
+            return self.seen_ahead(rows, Tensor::zeros(shape, DType::F32, &Device::Cpu)?);
         };
-        let correction = perceptron(layers, &rows.scaled()?)?;
-        Ok((self.integral(rows)? + (correction.reshape(shape)? * CORRECTION)?)?)
+        let correction = (perceptron(layers, &rows.scaled()?)?.reshape(shape)? * CORRECTION)?;
+        let correction = told_only(&correction, &rows.tell_anything())?;
+        Ok((self.seen_ahead(rows, self.integral(rows)?)? + correction)?)
+    }
+
+    /// The motion, and for rollouts of which nothing tells a speed, that of a camera that goes on as fast as the frames show.
+    pub(super) fn seen_ahead(&self, rows: &RolloutRows, motion: Tensor) -> Result<Tensor, NnError> {
+        let told = rows.told_speeds();
+        let Some(seen) = rows.seen_speeds().filter(|_| !told.iter().all(|told| *told)) else {
+            return Ok(motion);
+        };
+        let untold: Vec<bool> = told.iter().map(|told| !told).collect();
+        let arcs = arcs(&seen.tensor, rows.spec.horizon, rows.spec.frame_period_s)?;
+        Ok((told_only(&motion, &told)? + told_only(&arcs, &untold)?)?)
     }
 
     /// The motion of a base that follows its commands `[N, horizon, 3]`, on the CPU.
@@ -77,7 +92,7 @@ impl MotionHead {
         let spec = rows.spec;
         let channels = StateChannels::of(spec);
         let speeds = (0..rows.count())
-            .map(|row| channels.speeds(rows.state(row), rows.actions(row), spec.actions.len()))
+            .map(|row| channels.speeds(rows.first_speeds(row), rows.actions(row), spec.actions.len()))
             .collect();
         let wheels = match &self.wheels {
             Some(wheels) => wheels.to_device(&Device::Cpu)?,
@@ -106,5 +121,47 @@ impl MotionHead {
         let basis = basis.broadcast_as((items, pixels, 3))?.contiguous()?;
         let moved = basis.matmul(&map)?.broadcast_mul(&sides)?;
         Ok(Some(moved.broadcast_add(own)?))
+    }
+}
+
+/// Those rows of `[N, horizon, 3]`; 0 in the others.
+pub(super) fn told_only(values: &Tensor, rows: &[bool]) -> Result<Tensor, NnError> {
+    if rows.iter().all(|row| *row) {
+        return Ok(values.clone());
+    }
+    let factors: Vec<f32> = rows.iter().map(|&row| f32::from(u8::from(row))).collect();
+    Ok(values.broadcast_mul(&Tensor::from_vec(factors, (rows.len(), 1, 1), values.device())?)?)
+}
+
+/// Yaw, ahead and left `[N, horizon, 3]` of a camera that goes on at these speeds `[N, 2]`, in m/s and rad/s.
+fn arcs(speeds: &Tensor, horizon: usize, period_s: f64) -> Result<Tensor, NnError> {
+    let times: Vec<f32> = (1..=horizon).map(|step| (step as f64 * period_s) as f32).collect();
+    let times = Tensor::from_vec(times, (1, horizon), speeds.device())?;
+    let way = speeds.narrow(1, 0, 1)?.broadcast_mul(&times)?;
+    let yaw = speeds.narrow(1, 1, 1)?.broadcast_mul(&times)?;
+    // The chord of the arc over its length is sin h / h of half the turn, here by its series.
+    let half = (&yaw * 0.5)?;
+    let squared = half.sqr()?;
+    let chord = ((squared.affine(1.0 / 120.0, -1.0 / 6.0)? * &squared)? + 1.0)?;
+    let chord = (way * chord)?;
+    let (ahead, left) = ((&chord * half.cos()?)?, (&chord * half.sin()?)?);
+    Ok(Tensor::stack(&[yaw, ahead, left], 2)?)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_camera_that_keeps_its_speeds_drives_an_arc() {
+        let speeds = Tensor::new(&[[0.5f32, 1.0], [0.4, 0.0]], &Device::Cpu).unwrap();
+        let motion = arcs(&speeds, 5, 0.2).unwrap().to_vec3::<f32>().unwrap();
+        // A circle of 0.5 m: after a second, a turn of 1 rad.
+        let expected = [1.0, 0.5 * 1f32.sin(), 0.5 * (1.0 - 1f32.cos())];
+        for (found, expected) in motion[0][4].iter().zip(expected) {
+            assert!((found - expected).abs() < 1e-4, "{motion:?}");
+        }
+        assert_eq!(motion[1][4][0], 0.0);
+        assert!((motion[1][4][1] - 0.4).abs() < 1e-6 && motion[1][4][2] == 0.0);
     }
 }

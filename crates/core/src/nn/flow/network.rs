@@ -8,6 +8,7 @@ use super::motion::MotionHead;
 use super::mover_head::MoverHead;
 use super::rollout_rows::RolloutRows;
 use super::scene::Scene;
+use super::speed_head::SpeedHead;
 use crate::nn::error::NnError;
 use crate::nn::model_tensors::ModelTensors;
 use crate::nn::ops::activated_convolution::{Activation, activated_convolution};
@@ -31,6 +32,9 @@ pub struct FlowPrediction {
     /// Where movers are in the last frame and will be in each predicted one, as logits `[N, 1 + steps, P]`; `None` where the model
     /// does not tell.
     pub movers: Option<Tensor>,
+    /// How fast the camera drives and turns at the last frame, as seen in the frames: m/s and rad/s `[N, 2]`; `None` where the model
+    /// does not see it, or nothing needed it.
+    pub speeds: Option<Tensor>,
 }
 
 /// What the network knows of the surroundings.
@@ -55,6 +59,7 @@ pub(in crate::nn) struct FlowNetwork {
     pub(super) surroundings: Surroundings,
     pub(super) motion: MotionHead,
     pub(super) movers: Option<MoverHead>,
+    pub(super) speeds: Option<SpeedHead>,
     pub(super) modulation: [Linear; 2],
     pub(super) mix: Linear,
     pub(super) refine: Vec<[Convolution3; 2]>,
@@ -88,6 +93,7 @@ impl FlowNetwork {
             },
             motion: MotionHead::new(&spec, &sizes, tensors),
             movers: layers.movers.then(|| MoverHead::new(tensors)),
+            speeds: layers.speeds.then(|| SpeedHead::new(tensors)),
             modulation: ["inputs", "output"].map(|part| tensors.linear(&format!("flow.modulation.{part}"))),
             mix: tensors.linear(&format!("flow.{}", mix_name(layers))),
             refine: (0..layers.decoder_blocks)
@@ -123,6 +129,9 @@ impl FlowNetwork {
         if let Some(movers) = &mut self.movers {
             movers.pack()?;
         }
+        if let Some(speeds) = &mut self.speeds {
+            speeds.pack()?;
+        }
         match &mut self.surroundings {
             Surroundings::Remembered(scene) => scene.pack(),
             Surroundings::Seen(depth) => depth.pack(),
@@ -132,6 +141,23 @@ impl FlowNetwork {
     /// Whether gradients go to the weights.
     pub(super) fn is_trained(&self) -> bool {
         self.stem.weight.track_op()
+    }
+
+    /// The rollouts, with how fast their cameras drive as the frames show it, where the network sees that and it is of use.
+    pub(super) fn see_speeds<'a>(&self, rows: &RolloutRows<'a>) -> Result<RolloutRows<'a>, NnError> {
+        let Some(head) = self
+            .speeds
+            .as_ref()
+            .filter(|_| self.is_trained() || !rows.tell_speeds())
+        else {
+            return Ok(rows.part(0..rows.count()));
+        };
+        let contexts = rows.contexts(self.sizes.layers.frames_read);
+        rows.with_seen_speeds(&if self.is_plain {
+            head.plain_forward(&contexts)?
+        } else {
+            head.forward(&contexts)?
+        })
     }
 
     /// The states `[M, H/4, W/4, C]` after the decoder's modulated blocks.

@@ -15,6 +15,7 @@ mod recurrent;
 mod reprojection;
 mod room;
 mod scene;
+mod speed_head;
 
 use std::ops::Range;
 
@@ -73,7 +74,7 @@ impl FlowNetwork {
 
     fn plain_predict_rows(&self, rows: &RolloutRows, steps: usize) -> Result<FlowPrediction, NnError> {
         match &self.surroundings {
-            Surroundings::Seen(depth) => self.plain_predict_with_depth(rows, depth, steps),
+            Surroundings::Seen(depth) => self.plain_predict_with_depth(&self.see_speeds(rows)?, depth, steps),
             Surroundings::Remembered(scene) if self.sizes.layers.recurrent => {
                 self.plain_predict_recurrently(rows, scene, steps)
             }
@@ -159,6 +160,7 @@ impl FlowPrediction {
             scene: self.scene.as_ref().map(moved).transpose()?,
             motion: moved(&self.motion)?,
             movers: self.movers.as_ref().map(moved).transpose()?,
+            speeds: self.speeds.as_ref().map(moved).transpose()?,
         })
     }
 }

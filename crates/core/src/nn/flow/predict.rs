@@ -38,9 +38,14 @@ impl FlowNetwork {
     fn predict_rows(&self, rows: &RolloutRows, steps: usize) -> Result<FlowPrediction, NnError> {
         match &self.surroundings {
             Surroundings::Seen(depth) => {
+                let rows = &self.see_speeds(rows)?;
                 let seen = self.see_depth(rows, depth)?;
                 let movers = seen.movers.as_ref();
-                self.in_steps(rows, steps, movers, |ahead| self.predict_with_depth(ahead, &seen))
+                let predicted = self.in_steps(rows, steps, movers, |ahead| self.predict_with_depth(ahead, &seen))?;
+                Ok(FlowPrediction {
+                    speeds: rows.seen_speeds().map(|seen| seen.tensor.clone()),
+                    ..predicted
+                })
             }
             Surroundings::Remembered(scene) if self.sizes.layers.recurrent => {
                 self.predict_recurrently(rows, steps, scene)
@@ -134,6 +139,8 @@ impl FlowPrediction {
             scene: joined_if_given(parts, |part| part.scene.as_ref(), 0)?,
             motion: joined(|part| &part.motion)?,
             movers: joined_if_given(parts, |part| part.movers.as_ref(), 0)?,
+            // Parts whose states tell the speeds have none.
+            speeds: None,
         })
     }
 }

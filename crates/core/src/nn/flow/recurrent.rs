@@ -71,6 +71,7 @@ impl FlowNetwork {
         }
         let content = content_frames(&scene)?.unsqueeze(1)?;
         Ok(FlowPrediction {
+            speeds: None,
             frames: Tensor::stack(&frames, 1)?,
             scene: Some(content.broadcast_as((count, horizon, size.pixels()))?.contiguous()?),
             motion,

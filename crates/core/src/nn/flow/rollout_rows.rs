@@ -31,6 +31,16 @@ pub(super) struct RolloutRows<'a> {
     cameras: Vec<CameraModel>,
     /// The channels of the state that the layers read.
     read: Vec<usize>,
+    /// How fast the camera drives and turns, as seen in the frames; `None` where nothing needs it.
+    seen_speeds: Option<SeenSpeeds>,
+}
+
+/// Forward speed and yaw rate at the last frame of each rollout's context, as seen in the frames.
+#[derive(Clone)]
+pub(super) struct SeenSpeeds {
+    /// `[N, 2]`, in m/s and rad/s; gradients go to the layers that see them.
+    pub(super) tensor: Tensor,
+    values: Vec<[f32; 2]>,
 }
 
 impl<'a> RolloutRows<'a> {
@@ -64,6 +74,7 @@ impl<'a> RolloutRows<'a> {
             past_states,
             cameras,
             read: spec.states_read_by_layers(),
+            seen_speeds: None,
         })
     }
 
@@ -72,9 +83,54 @@ impl<'a> RolloutRows<'a> {
         self.windows.len()
     }
 
+    /// The same rollouts, whose frames show that each context's camera drives and turns that fast `[contexts, 2]`.
+    pub(super) fn with_seen_speeds(&self, of_contexts: &Tensor) -> Result<Self, NnError> {
+        let context_of = Tensor::new(self.context_of(), of_contexts.device())?;
+        let tensor = of_contexts.index_select(&context_of, 0)?;
+        let values = tensor
+            .detach()
+            .to_device(&Device::Cpu)?
+            .flatten_all()?
+            .to_vec1::<f32>()?;
+        let values = values.as_chunks::<2>().0.to_vec();
+        Ok(Self {
+            seen_speeds: Some(SeenSpeeds { tensor, values }),
+            ..self.part(0..self.count())
+        })
+    }
+
+    /// What [`Self::with_seen_speeds`] gave.
+    pub(super) fn seen_speeds(&self) -> Option<&SeenSpeeds> {
+        self.seen_speeds.as_ref()
+    }
+
+    /// Whether the state of each rollout tells both speeds.
+    pub(super) fn tell_speeds(&self) -> bool {
+        let channels = StateChannels::of(self.spec);
+        (0..self.count()).all(|row| channels.measured_speeds_in(self.state(row)).is_some())
+    }
+
+    /// The speeds that a rollout starts with: measured, else seen.
+    pub(super) fn first_speeds(&self, row: usize) -> [Option<f32>; 2] {
+        let measured = StateChannels::of(self.spec).measured_in(self.state(row));
+        let seen = self.seen_speeds.as_ref().map(|seen| seen.values[row]);
+        std::array::from_fn(|part| measured[part].or(seen.map(|seen| seen[part])))
+    }
+
+    /// Whether each rollout's states or actions tell a speed.
+    pub(super) fn told_speeds(&self) -> Vec<bool> {
+        let channels = StateChannels::of(self.spec);
+        let told = |row: usize| {
+            let measured = channels.measured_in(self.state(row));
+            measured.iter().any(Option::is_some) || channels.commands_speed_in(self.actions(row))
+        };
+        (0..self.count()).map(told).collect()
+    }
+
     /// Some of the rollouts.
     pub(super) fn part(&self, range: Range<usize>) -> Self {
         Self {
+            seen_speeds: self.seen_speeds.as_ref().map(|seen| seen.part(range.clone())),
             spec: self.spec,
             frames: Arc::clone(&self.frames),
             windows: self.windows[range.clone()].to_vec(),
@@ -122,7 +178,7 @@ impl<'a> RolloutRows<'a> {
                 return motion;
             }
         }
-        let [forward, yaw_rate] = channels.measured_speeds_in(state).unwrap_or_default();
+        let [forward, yaw_rate] = self.first_speeds(row).map(Option::unwrap_or_default);
         let time = -(self.spec.frame_period_s as f32) * back as f32;
         let (sin, cos) = (yaw_rate * time / 2.0).sin_cos();
         [yaw_rate * time, forward * time * cos, forward * time * sin]
@@ -133,7 +189,7 @@ impl<'a> RolloutRows<'a> {
         StateChannels::of(self.spec).pose_in(self.state(row))
     }
 
-    /// State and all actions of each rollout, scaled, `[N, S + horizon · A]`.
+    /// State and all actions of each rollout, scaled, `[N, S + horizon · A]`; 0 for what is not known.
     pub(super) fn scaled(&self) -> Result<Tensor, NnError> {
         let rows: Vec<f32> = (0..self.count()).flat_map(|row| self.scaled_row(row)).collect();
         Ok(Tensor::from_vec(rows, (self.count(), ()), &Device::Cpu)?)
@@ -144,7 +200,20 @@ impl<'a> RolloutRows<'a> {
         let mut scaled: Vec<f32> = self.read.iter().map(|&channel| state[channel]).collect();
         let actions = self.actions(row).iter().zip(self.spec.actions.iter().cycle());
         scaled.extend(actions.map(|(value, channel)| channel.scaled(*value)));
+        for value in scaled.iter_mut().filter(|value| value.is_nan()) {
+            *value = 0.0;
+        }
         scaled
+    }
+
+    /// Whether anything that the layers read of each rollout's state and actions is known.
+    pub(super) fn tell_anything(&self) -> Vec<bool> {
+        let told = |row: usize| {
+            let state = self.state(row);
+            let read = self.read.iter().map(|&channel| state[channel]);
+            read.chain(self.actions(row).iter().copied()).any(f32::is_finite)
+        };
+        (0..self.count()).map(told).collect()
     }
 
     /// Per item: the scaled state, the scaled actions up to the step (zero after it) and which step it is, `[M, …]`.
@@ -166,9 +235,11 @@ impl<'a> RolloutRows<'a> {
     /// Whether two rollouts follow the same context.
     fn is_same_context(&self, row: usize, other: usize) -> bool {
         let past = |row: usize| self.of_rows(&self.past_states, row..row + 1);
+        // Of values that are not known too, which are NaN.
+        let are_same = |a: &[f32], b: &[f32]| a.iter().map(|a| a.to_bits()).eq(b.iter().map(|b| b.to_bits()));
         self.windows[row] == self.windows[other]
-            && self.state(row) == self.state(other)
-            && past(row) == past(other)
+            && are_same(self.state(row), self.state(other))
+            && are_same(past(row), past(other))
             && self.cameras.get(row) == self.cameras.get(other)
     }
 
@@ -223,5 +294,16 @@ impl<'a> RolloutRows<'a> {
             views.cameras.push(self.camera(row));
         }
         views
+    }
+}
+
+impl SeenSpeeds {
+    #[expect(clippy::expect_used, reason = "the rows are those of the rollouts")]
+    fn part(&self, range: Range<usize>) -> Self {
+        let tensor = self.tensor.narrow(0, range.start, range.len());
+        Self {
+            tensor: tensor.expect("a row that there is not is a bug"),
+            values: self.values[range].to_vec(),
+        }
     }
 }

@@ -54,6 +54,7 @@ impl PredictedAhead {
             scene: self.scene,
             motion,
             movers: self.movers,
+            speeds: None,
         }
     }
 }

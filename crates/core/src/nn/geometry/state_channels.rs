@@ -61,12 +61,24 @@ impl StateChannels {
         self.measured[1].map(|channel| state[channel])
     }
 
-    /// Forward speed and yaw rate in a state, if both are measured.
+    /// Forward speed and yaw rate in a state, each if it is measured and known.
+    pub(in crate::nn) fn measured_in(self, state: &[f32]) -> [Option<f32>; 2] {
+        self.measured
+            .map(|channel| channel.map(|channel| state[channel]).filter(|speed| speed.is_finite()))
+    }
+
+    /// Forward speed and yaw rate in a state, if both are measured and known.
     pub(in crate::nn) fn measured_speeds_in(self, state: &[f32]) -> Option<[f32; 2]> {
-        match self.measured {
-            [Some(forward), Some(yaw)] => Some([state[forward], state[yaw]]),
+        match self.measured_in(state) {
+            [Some(forward), Some(yaw)] => Some([forward, yaw]),
             _ => None,
         }
+    }
+
+    /// Whether an action commands a speed that is known.
+    pub(in crate::nn) fn commands_speed_in(self, action: &[f32]) -> bool {
+        let mut commanded = self.commanded.into_iter().flatten();
+        commanded.any(|channel| action.get(channel).is_some_and(|speed| speed.is_finite()))
     }
 
     /// Moves a state on: its pose by the motion, its speeds to those of the last action. Other channels stay.
@@ -89,15 +101,20 @@ impl StateChannels {
         self.commanded.iter().any(Option::is_some)
     }
 
-    /// The speeds of a rollout. One that is not commanded stays as measured; one that is not measured starts as commanded.
-    /// `actions` holds them step after step, `action_count` components each.
-    pub(in crate::nn) fn speeds(self, state: &[f32], actions: &[f32], action_count: usize) -> CommandedSpeeds {
-        let measured = self.measured.map(|channel| channel.map(|channel| state[channel]));
+    /// The speeds of a rollout that starts with the measured ones. One that is not commanded stays as measured; one that is not
+    /// measured starts as commanded. `actions` holds them step after step, `action_count` components each.
+    pub(in crate::nn) fn speeds(
+        self,
+        measured: [Option<f32>; 2],
+        actions: &[f32],
+        action_count: usize,
+    ) -> CommandedSpeeds {
         let commands: Vec<[f32; 2]> = actions
             .chunks_exact(action_count.max(1))
             .map(|action| {
                 std::array::from_fn(|part| {
                     let commanded = self.commanded[part].map(|channel| action[channel]);
+                    let commanded = commanded.filter(|speed| speed.is_finite());
                     commanded.or(measured[part]).unwrap_or(0.0)
                 })
             })
@@ -143,10 +160,31 @@ impl ModelSpec {
         Some(counted)
     }
 
+    /// Whether the model estimates from the frames how fast the camera drives, so that states and actions may be missing.
+    #[must_use]
+    pub fn sees_speeds(&self) -> bool {
+        self.flow().is_some_and(|flow| flow.layers.speeds)
+    }
+
     /// Whether a prediction uses the states at the context's earlier frames: it says from the poses how the camera has moved.
     #[must_use]
     pub fn reads_past_states(&self) -> bool {
         StateChannels::of(self).pose.is_some() && self.flow().is_some_and(|flow| flow.layers.depth)
+    }
+
+    /// Forward speed and yaw rate in each state `[B, S]`: `[B, 2]` in m/s and rad/s, NaN where they are not known. `None` if the states
+    /// do not have both.
+    #[doc(hidden)]
+    pub fn measured_speeds(&self, state: &Tensor) -> Result<Option<Tensor>, NnError> {
+        let channels = StateChannels::of(self);
+        if channels.measured.iter().any(Option::is_none) {
+            return Ok(None);
+        }
+        let (batch, count) = state.dims2()?;
+        let states = state.flatten_all()?.to_vec1::<f32>()?;
+        let speeds = |state: &[f32]| channels.measured_in(state).map(|speed| speed.unwrap_or(f32::NAN));
+        let speeds: Vec<f32> = states.chunks_exact(count).flat_map(speeds).collect();
+        Ok(Some(Tensor::from_vec(speeds, (batch, 2), &Device::Cpu)?))
     }
 
     /// How the camera moved from the state `[B, S]` to each of the later states `[B, T, S]`: yaw, ahead and left

@@ -46,6 +46,9 @@ pub struct FlowLayers {
     /// Whether it also tells where movers are: other robots, in the last frame and in each predicted one. Only with `depth`;
     /// training needs masks of them.
     pub movers: bool,
+    /// Whether it also estimates from the frames how fast the camera drives and turns. This stands in for the states and actions that
+    /// a robot does not tell. Only with `depth`.
+    pub speeds: bool,
     /// Whether each step continues from the state and the frame of the step before it, instead of starting from the last
     /// true frame. Only for models that take no actions.
     pub recurrent: bool,
@@ -64,13 +67,14 @@ impl Default for FlowLayers {
             frames_read: 3,
             depth: false,
             movers: false,
+            speeds: false,
             recurrent: false,
         }
     }
 }
 
 impl FlowSpec {
-    /// Errors: `Camera`, `RecurrentActions`, `RecurrentDepth`, `MoversDepth`, `FrameSides` and those of the layers, for a model with
+    /// Errors: `Camera`, `RecurrentActions`, `RecurrentDepth`, `MoversDepth`, `SpeedsDepth`, `FrameSides` and those of the layers, for a model with
     /// this conditioning and frames of this width and height.
     pub(super) fn check(&self, conditioning: Conditioning, sides_px: [u32; 2]) -> Result<(), NnError> {
         if let Some(camera) = &self.camera {
@@ -85,6 +89,9 @@ impl FlowSpec {
         }
         if self.layers.movers && !self.layers.depth {
             return Err(NnError::MoversDepth);
+        }
+        if self.layers.speeds && !self.layers.depth {
+            return Err(NnError::SpeedsDepth);
         }
         let [least, most] = SIDES_PX;
         let fits = |side: u32| (least..=most).contains(&side) && side.is_multiple_of(least);

@@ -39,6 +39,8 @@ impl TrainConfig {
             ("sequence.scene_weight", sequence.scene_weight, 100.0),
             ("sequence.motion_weight", sequence.motion_weight, 100.0),
             ("sequence.movers_weight", sequence.movers_weight, 100.0),
+            ("sequence.speeds_weight", sequence.speeds_weight, 100.0),
+            ("data.hidden", self.data.hidden, 1.0),
             ("data.brightness", self.data.brightness, 0.9),
             ("data.crop", self.data.crop, 0.5),
             ("run.final_learning_rate", run.final_learning_rate, 1.0),
@@ -104,6 +106,13 @@ impl TrainConfig {
                 "data.reverse is true, but actions and states do not fit a window that is played backwards; \
                  model.conditioning is {}: set it to none, or data.reverse to false",
                 self.model.conditioning
+            ));
+        }
+        if self.data.hidden > 0.0 && !self.sees_speeds() {
+            return refused(format!(
+                "data.hidden is {}, but without states and actions only a network with model.flow.speeds can tell how the camera \
+                 drives; set that to true, or data.hidden to 0",
+                self.data.hidden
             ));
         }
         if sequence.short_share > 0.0 && !(1..=self.model.horizon).contains(&sequence.short_horizon) {

@@ -57,6 +57,7 @@ impl FlowNetwork {
             frames: ahead.in_rows(&frames)?,
             scene: None,
             movers: self.plain_movers(&steps)?,
+            speeds: rows.seen_speeds().map(|seen| seen.tensor.clone()),
             motion: steps.ahead.motion,
         })
     }

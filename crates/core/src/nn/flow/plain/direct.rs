@@ -55,6 +55,7 @@ impl FlowNetwork {
         let content = pixel_shuffle(&content(&seen)?)?.flatten_from(1)?;
         let frames = places.compose(&last, size, &head, &content)?;
         Ok(FlowPrediction {
+            speeds: None,
             frames: ahead.in_rows(&frames)?.narrow(1, 0, steps)?.contiguous()?,
             scene: Some(ahead.in_rows(&content)?),
             motion: ahead.motion,

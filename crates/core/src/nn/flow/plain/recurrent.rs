@@ -56,6 +56,7 @@ impl FlowNetwork {
         }
         let content = content.unsqueeze(1)?.broadcast_as((count, horizon, size.pixels()))?;
         Ok(FlowPrediction {
+            speeds: None,
             frames: Tensor::stack(&frames, 1)?,
             scene: Some(content.contiguous()?),
             motion: once.motion,

@@ -1,0 +1,146 @@
+//! Estimates the camera of a recording: the one with which a model that sees depth predicts its frames best.
+
+use super::EvaluationError;
+use super::inference::{ActionSource, Inference};
+use super::windows::evenly;
+use foreframe_core::frame::warp::CameraModel;
+use foreframe_core::registry::Model;
+use foreframe_data::dataset::sampler::{Split, Splits, WindowShape};
+use foreframe_data::dataset::{Dataset, Window};
+
+/// Training windows that are predicted with each camera.
+const WINDOWS: usize = 48;
+/// Windows that are predicted together.
+const TOGETHER: usize = 16;
+/// Fields of view that are tried first, in degrees.
+const FIELDS_OF_VIEW: [f32; 5] = [50.0, 70.0, 90.0, 110.0, 130.0];
+/// Tilts that are tried first, in degrees.
+const TILTS: [f32; 5] = [-10.0, 0.0, 10.0, 20.0, 30.0];
+/// Half of the distance between them: what is tried around the best one.
+const FINER: f32 = 10.0;
+const FINER_TILT: f32 = 5.0;
+/// Standard errors by which the errors of another camera may differ for it to count as possible.
+const POSSIBLE: f64 = 2.0;
+
+/// A camera that was estimated.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct CameraEstimate {
+    /// The one with the least error.
+    pub camera: CameraModel,
+    /// Least and greatest field of view of the cameras that are as good as the windows can tell, in degrees.
+    pub fields_of_view_deg: [f32; 2],
+    /// The same of the tilt.
+    pub tilts_deg: [f32; 2],
+    /// Windows that were predicted with each camera.
+    pub windows: usize,
+}
+
+/// One that was tried, with the error of each window.
+struct Tried {
+    degrees: [f32; 2],
+    errors: Vec<f64>,
+}
+
+impl Tried {
+    fn mean(&self) -> f64 {
+        self.errors.iter().sum::<f64>() / self.errors.len() as f64
+    }
+
+    /// Whether its errors may be no larger than those of the other.
+    fn is_as_good_as(&self, best: &Self) -> bool {
+        let count = self.errors.len() as f64;
+        let differences: Vec<f64> = self.errors.iter().zip(&best.errors).map(|(a, b)| a - b).collect();
+        let mean = differences.iter().sum::<f64>() / count;
+        let variance = differences.iter().map(|value| (value - mean).powi(2)).sum::<f64>() / count;
+        mean <= POSSIBLE * (variance / count).sqrt()
+    }
+}
+
+/// The camera of a data set whose camera is not known, by its training windows; `height_m` says in which unit distances count.
+/// `None` if no window fits. Errors: `Mismatch`, those of the network and of [`Dataset::pixels`].
+pub fn estimate_camera(
+    loaded: &Model,
+    dataset: &Dataset,
+    height_m: f32,
+) -> Result<Option<CameraEstimate>, EvaluationError> {
+    super::compatible::check(loaded, dataset)?;
+    let windows = evenly(&windows_of(loaded, dataset, Split::Train)?, WINDOWS);
+    if windows.is_empty() {
+        return Ok(None);
+    }
+    let camera = |[field, tilt]: [f32; 2]| CameraModel {
+        horizontal_fov_rad: field.to_radians(),
+        tilt_down_rad: tilt.to_radians(),
+        height_m: Some(height_m),
+    };
+    let try_one = |degrees: [f32; 2]| -> Result<Tried, EvaluationError> {
+        let with_camera = dataset.clone().with_camera(camera(degrees));
+        let errors = window_errors(loaded, &with_camera, &windows)?;
+        Ok(Tried { degrees, errors })
+    };
+    let first = FIELDS_OF_VIEW
+        .into_iter()
+        .flat_map(|field| TILTS.map(|tilt| [field, tilt]));
+    let mut tried = first.map(try_one).collect::<Result<Vec<_>, _>>()?;
+    let [field, tilt] = best(&tried).degrees;
+    for [more, down] in [
+        [-1.0, 0.0],
+        [1.0, 0.0],
+        [0.0, -1.0],
+        [0.0, 1.0],
+        [-1.0, -1.0],
+        [1.0, 1.0],
+        [-1.0, 1.0],
+        [1.0, -1.0],
+    ] {
+        tried.push(try_one([field + more * FINER, tilt + down * FINER_TILT])?);
+    }
+    let best = best(&tried);
+    let possible = tried.iter().filter(|other| other.is_as_good_as(best));
+    let range = |part: usize| {
+        let values = possible.clone().map(|other| other.degrees[part]);
+        values.fold([f32::INFINITY, f32::NEG_INFINITY], |[least, most], value| {
+            [least.min(value), most.max(value)]
+        })
+    };
+    Ok(Some(CameraEstimate {
+        camera: camera(best.degrees),
+        fields_of_view_deg: range(0),
+        tilts_deg: range(1),
+        windows: windows.len(),
+    }))
+}
+
+fn best(tried: &[Tried]) -> &Tried {
+    let least = tried.iter().min_by(|a, b| a.mean().total_cmp(&b.mean()));
+    least.expect("no camera that was tried is a bug")
+}
+
+/// The windows of a split that the model can predict, in order; none if no segment is long enough. Errors: those of [`Splits::windows`].
+pub fn windows_of(loaded: &Model, dataset: &Dataset, split: Split) -> Result<Vec<Window>, EvaluationError> {
+    let spec = loaded.spec();
+    let shape = WindowShape {
+        context: spec.context,
+        horizon: spec.horizon,
+    };
+    let splits = Splits::new(dataset, loaded.manifest.dataset.split_seed);
+    match splits.windows(dataset, split, shape, 1) {
+        Err(foreframe_data::dataset::DatasetError::WindowTooLong { .. }) => Ok(Vec::new()),
+        windows => Ok(windows?),
+    }
+}
+
+/// The mean squared error of each window's predicted frames, intensities 0…1. Errors: those of the network and of [`Dataset::pixels`].
+pub fn window_errors(loaded: &Model, dataset: &Dataset, windows: &[Window]) -> Result<Vec<f64>, EvaluationError> {
+    let inference = Inference { loaded, dataset };
+    let each = loaded.spec().horizon * loaded.spec().pixels();
+    let mut errors = Vec::with_capacity(windows.len());
+    for windows in windows.chunks(TOGETHER) {
+        let predicted = inference.predict(windows, ActionSource::Recorded)?;
+        for (&window, frames) in windows.iter().zip(predicted.frames.chunks_exact(each)) {
+            let steps = inference.step_errors(window, frames)?;
+            errors.push(steps.iter().sum::<f64>() / steps.len() as f64);
+        }
+    }
+    Ok(errors)
+}
