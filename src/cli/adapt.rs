@@ -183,7 +183,7 @@ fn compared_windows(base: &Model, dataset: &Dataset) -> Result<Vec<Window>, CliE
 }
 
 fn mean_error(model: &Model, dataset: &Dataset, windows: &[Window]) -> Result<f64, CliError> {
-    let errors = evaluation::window_errors(model, dataset, windows)?;
+    let errors = evaluation::window_errors(model, dataset, windows, model.spec().horizon)?;
     Ok(errors.iter().sum::<f64>() / errors.len() as f64)
 }
 

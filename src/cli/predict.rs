@@ -128,7 +128,7 @@ fn input(
         let file = ActionsFile::read(path)?;
         file.check(path, selected.last, spec)?;
         file.fill_in(&mut input, selected.last, spec);
-    } else if spec.action_inputs().is_some() {
+    } else if spec.action_inputs().is_some() && !spec.sees_speeds() {
         return Err(CliError::Usage(format!(
             "--actions is missing; model {name:?} takes {}",
             error_text::comma_separated(&spec.actions)

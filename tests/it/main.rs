@@ -102,6 +102,7 @@ mod sizes;
 mod skip;
 mod slow_clients;
 mod source_graph;
+mod speeds;
 mod steering;
 mod store;
 mod store_attempts;

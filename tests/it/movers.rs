@@ -7,7 +7,7 @@ use candle_core::{Device, Tensor};
 use foreframe_core::nn::{ConditioningTensors, FlowPrediction};
 use foreframe_core::registry::{self, StoredWeights};
 use foreframe_core::types::Seed;
-use foreframe_data::dataset::{Dataset, DatasetInfo, EpisodeData};
+use foreframe_data::dataset::{Dataset, DatasetInfo, EpisodeData, Lacking};
 use foreframe_sim::{RoomSet, Scenario, World, WorldConfig, arena};
 use foreframe_train::training::{TrainConfig, TrainError, Training, TrainingOutcome, run};
 
@@ -164,7 +164,7 @@ fn movers_cannot_be_learned_without_masks_weight_or_depth() {
 #[test]
 fn joined_data_sets_keep_their_masks_if_all_have_them() {
     let (first, second) = (moving_squares(4, SIDE, 0.2), moving_squares(6, SIDE, 0.2));
-    let joined = Dataset::join(vec![(first.clone(), 1.0), (second.clone(), 1.0)]).unwrap();
+    let joined = Dataset::join(vec![(first.clone(), 1.0), (second.clone(), 1.0)], Lacking::Refused).unwrap();
     assert!(joined.info().has_masks);
     let offset = first.info().frame_count;
     for frame in [0, 7, second.info().frame_count - 1] {

@@ -298,23 +298,36 @@ fn decode(loaded: &Model, codes: &Tensor, total: usize) -> Result<Vec<Frame>, Fa
     Ok(frames)
 }
 
-/// Actions `[N, steps, A]` and states `[N, S]` in physical units, if the model takes them.
+/// Actions `[N, steps, A]` and states `[N, S]` in physical units, if the model takes them; NaN where they are not known.
 fn condition(spec: &ModelSpec, inputs: &[&ConditioningInput], steps: usize) -> Result<ConditioningTensors, Failure> {
-    let actions = inputs
-        .iter()
-        .flat_map(|input| &input.actions)
-        .flat_map(Action::as_slice);
-    let states = inputs
-        .iter()
-        .flat_map(|input| &input.state)
-        .flat_map(RobotState::as_slice);
-    let tensor = |values: Vec<f32>, shape: &[usize]| {
-        let given = !values.is_empty();
-        given.then(|| Tensor::from_vec(values, shape, &Device::Cpu)).transpose()
+    let tensor = |used: Option<usize>, rows: Vec<Vec<f32>>, shape: &[usize]| {
+        let each: usize = shape[1..].iter().product();
+        let filled = rows.into_iter().flat_map(|mut row| {
+            row.resize(each, f32::NAN);
+            row
+        });
+        used.map(|_| Tensor::from_vec(filled.collect::<Vec<_>>(), shape, &Device::Cpu))
+            .transpose()
     };
+    let actions = inputs.iter().map(|input| {
+        let actions = input.actions.iter().flat_map(Action::as_slice);
+        actions.copied().collect()
+    });
+    let states = inputs.iter().map(|input| {
+        let state = input.state.iter().flat_map(RobotState::as_slice);
+        state.copied().collect()
+    });
     Ok(ConditioningTensors {
-        actions: tensor(actions.copied().collect(), &[inputs.len(), steps, spec.actions.len()])?,
-        state: tensor(states.copied().collect(), &[inputs.len(), spec.states.len()])?,
+        actions: tensor(
+            spec.action_inputs(),
+            actions.collect(),
+            &[inputs.len(), steps, spec.actions.len()],
+        )?,
+        state: tensor(
+            spec.state_inputs(),
+            states.collect(),
+            &[inputs.len(), spec.states.len()],
+        )?,
         ..ConditioningTensors::none()
     })
 }

@@ -7,7 +7,8 @@ use crate::nn::{ChannelScale, Conditioning, ModelSpec};
 use crate::registry::Manifest;
 use crate::types::{Action, ModelName, RobotState};
 
-/// The state at the last frame and the action for each predicted frame, as far as the model takes them. Checked.
+/// The state at the last frame and the action for each predicted frame, as far as the model takes them. Checked. Of a model that sees
+/// how fast the camera drives, both may be missing.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ConditioningInput {
     pub(super) actions: Vec<Action>,
@@ -79,6 +80,7 @@ impl ConditioningInput {
                 actions.to_vec()
             }
             (None, Some(held)) => vec![held.clone(); steps],
+            (None, None) if spec.sees_speeds() => Vec::new(),
             (None, None) => {
                 return Err(InputError::Missing {
                     field: fields.missing,
@@ -146,6 +148,9 @@ fn check_state(manifest: &Manifest, state: Option<RobotState>) -> Result<Option<
         return Ok(None);
     }
     let Some(state) = state else {
+        if spec.sees_speeds() {
+            return Ok(None);
+        }
         return Err(InputError::Missing {
             field: "state",
             model: model.clone(),

@@ -47,8 +47,8 @@ pub enum OptimizerError {
         /// The tensor.
         name: String,
     },
-    /// The gradients to average belong to different tensors, or there are none.
-    #[error("the gradients to average must belong to the same tensors, and there must be at least one part")]
+    /// There are no gradients to average.
+    #[error("there are no gradients to average; there must be at least one part")]
     Join,
     /// An exported state does not match the parameters.
     #[error("optimizer state: tensor \"{name}\" {problem}")]

@@ -39,19 +39,20 @@ impl Gradients {
         Ok(Self { loss: value, by_name })
     }
 
-    /// The mean of the gradients and losses of equally large parts of a batch, summed in the order given.
-    /// Errors: `Join`.
+    /// The mean of the gradients and losses of equally large parts of a batch, summed in the order given. A part whose loss does not
+    /// depend on a tensor has no gradient of it, which counts as 0. Errors: `Join`.
     pub fn mean(parts: Vec<Self>) -> Result<Self, OptimizerError> {
         let weight = 1.0 / parts.len() as f64;
         let mut parts = parts.into_iter();
         let mut joined = parts.next().ok_or(OptimizerError::Join)?;
         for part in parts {
-            if !part.by_name.keys().eq(joined.by_name.keys()) {
-                return Err(OptimizerError::Join);
-            }
             joined.loss += part.loss;
-            for (sum, gradient) in joined.by_name.values_mut().zip(part.by_name.values()) {
-                *sum = (&*sum + gradient)?;
+            for (name, gradient) in part.by_name {
+                let sum = match joined.by_name.get(&name) {
+                    Some(sum) => (sum + gradient)?,
+                    None => gradient,
+                };
+                joined.by_name.insert(name, sum);
             }
         }
         joined.loss *= weight;

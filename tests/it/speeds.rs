@@ -1,0 +1,234 @@
+//! Networks that see how fast the camera drives: trained on the simulator, they do without states and actions.
+
+use std::path::Path;
+use std::sync::atomic::AtomicBool;
+
+use candle_core::{Device, Tensor};
+use foreframe_core::nn::ConditioningTensors;
+use foreframe_core::registry::{self, StoredWeights};
+use foreframe_core::types::Channel;
+use foreframe_data::dataset::{Dataset, DatasetInfo, EpisodeData, Lacking};
+use foreframe_train::evaluation::window_errors;
+use foreframe_train::training::{TrainConfig, TrainError, Training, TrainingOutcome, run};
+
+use crate::process::{output, text};
+
+const SIDE: usize = 16;
+const FRAMES: usize = 14;
+const PERIOD_S: f64 = 0.2;
+/// Radians that a pixel spans, about, for the camera of the data set.
+const PIXEL_RAD: f32 = 1.0 / SIDE as f32;
+
+/// A camera that turns at a constant rate before stripes; the speeds are in states and actions, unless the recording is `plain`.
+fn turning(name: &str, episodes: usize, plain: bool) -> Dataset {
+    let data = (0..episodes).map(|episode| {
+        let rate = [-0.6f32, -0.3, 0.3, 0.6, 0.45, -0.45][episode % 6];
+        let shade = |frame: usize, pixel: usize| {
+            // A turn to the left moves the picture to the right.
+            let shift = rate * PERIOD_S as f32 * frame as f32 / PIXEL_RAD;
+            let at = (pixel % SIDE) as f32 - shift + 3.7 * episode as f32;
+            (128.0 + 60.0 * (at * 0.7).sin() + 40.0 * (at * 0.31 + (pixel / SIDE) as f32 * 0.2).cos()) as u8
+        };
+        let speeds = if plain { vec![] } else { [0.0, rate].repeat(FRAMES) };
+        EpisodeData {
+            pixels: (0..FRAMES)
+                .flat_map(|frame| (0..SIDE * SIDE).map(move |pixel| shade(frame, pixel)))
+                .collect(),
+            actions: speeds.clone(),
+            states: speeds,
+            timestamps_s: (0..FRAMES).map(|frame| frame as f64 * PERIOD_S).collect(),
+            ..EpisodeData::default()
+        }
+    });
+    let channels = || match plain {
+        true => Vec::new(),
+        false => vec![Channel::new("linear", "m/s"), Channel::new("angular", "rad/s")],
+    };
+    let info = DatasetInfo {
+        name: name.to_owned(),
+        frame_width_px: SIDE as u32,
+        frame_height_px: SIDE as u32,
+        frame_period_s: PERIOD_S,
+        action_channels: channels(),
+        state_channels: channels(),
+        camera: Some(foreframe_core::frame::warp::CameraModel::new(1.0, 0.0).unwrap()),
+        ..DatasetInfo::default()
+    };
+    Dataset::from_episodes(info, data.collect()).unwrap()
+}
+
+fn config(settings: &[&str]) -> TrainConfig {
+    let small = [
+        "name=turning",
+        "data.validation_windows=8",
+        "data.hidden=0.6",
+        "sequence.steps=250",
+        "sequence.batch_size=8",
+        "sequence.learning_rate=0.004",
+        "sequence.speeds_weight=0.1",
+        "model.context=3",
+        "model.horizon=2",
+        "model.flow={ channels = 12, stem_channels = 8, enlarged_channels = 4, fine_channels = 6, frames_read = 3, \
+         depth = true, speeds = true }",
+        "run.validate_every_steps=250",
+        "run.checkpoint_every_steps=250",
+        "run.warmup_steps=10",
+    ];
+    let settings = small.iter().chain(settings).map(|&setting| setting.to_owned());
+    TrainConfig::layered("rooms", None, &settings.collect::<Vec<_>>()).unwrap()
+}
+
+fn train(
+    config: &TrainConfig,
+    dataset: &Dataset,
+    run_dir: &Path,
+    start: Option<&StoredWeights>,
+) -> Result<TrainingOutcome, TrainError> {
+    let training = Training {
+        config,
+        dataset,
+        run_dir,
+        command: "foreframe train",
+        start,
+    };
+    run(&training, &mut |_| {}, &AtomicBool::new(false))
+}
+
+#[test]
+fn a_network_sees_how_fast_the_camera_turns() {
+    let (dataset, dir) = (turning("turning", 40, false), tempfile::tempdir().unwrap());
+    let run_dir = dir.path().join("run");
+    train(&config(&[]), &dataset, &run_dir, None).unwrap();
+    let model = registry::load(&run_dir.join("model")).unwrap();
+    let spec = model.spec();
+    let context = |episode: usize| -> Vec<f32> {
+        let first = dataset.episodes()[episode].first_frame;
+        let frames = first..first + spec.context;
+        frames
+            .flat_map(|frame| spec.preprocess.forward(&dataset.frame(frame).unwrap()))
+            .collect()
+    };
+    let seen: Vec<f32> = (0..6).flat_map(context).collect();
+    let frames = Tensor::from_vec(seen, (6, spec.context, spec.pixels()), &Device::Cpu).unwrap();
+    let predicted = model
+        .network
+        .predict_flow(&frames, &ConditioningTensors::none(), spec.horizon)
+        .unwrap()
+        .unwrap();
+    let speeds = predicted.speeds.unwrap().to_vec2::<f32>().unwrap();
+    for (episode, speeds) in speeds.iter().enumerate() {
+        let truth = dataset.state(dataset.episodes()[episode].first_frame)[1];
+        assert!((speeds[1] - truth).abs() < 0.2, "{speeds:?}, not {truth}");
+    }
+    // The same pictures without states and actions are predicted nearly as well, and far better than by their last frame.
+    let windows =
+        foreframe_train::evaluation::windows_of(&model, &dataset, foreframe_data::dataset::Split::Test).unwrap();
+    let mean = |dataset: &Dataset| {
+        let errors = window_errors(&model, dataset, &windows, spec.horizon).unwrap();
+        errors.iter().sum::<f64>() / errors.len() as f64
+    };
+    let (told, untold) = (mean(&dataset), mean(&turning("plain", 40, true)));
+    assert!(untold < 2.0 * told + 5e-4, "{untold}, {told} with states and actions");
+}
+
+#[test]
+fn data_sets_without_states_join_others_where_the_network_needs_none() {
+    let (first, second) = (turning("turning", 20, false), turning("plain", 12, true));
+    let weighted = || vec![(first.clone(), 1.0), (second.clone(), 1.0)];
+    let error = Dataset::join(weighted(), Lacking::Refused).unwrap_err().to_string();
+    assert!(error.contains("lacks the action channel linear"), "{error}");
+    let joined = Dataset::join(weighted(), config(&[]).lacking()).unwrap();
+    let offset = first.info().frame_count;
+    assert!(
+        joined
+            .action(offset)
+            .iter()
+            .chain(joined.state(offset))
+            .all(|value| value.is_nan())
+    );
+    assert_eq!(joined.action(3), first.action(3));
+
+    let dir = tempfile::tempdir().unwrap();
+    train(&config(&["sequence.steps=4"]), &joined, &dir.path().join("run"), None).unwrap();
+    let start = registry::load_weights(&dir.path().join("run/model")).unwrap();
+    assert!(
+        start
+            .manifest
+            .spec
+            .states
+            .iter()
+            .all(|channel| channel.mean.is_finite())
+    );
+
+    // A recording with other channels: what both have stays.
+    let settings = ["sequence.steps=2", "model.conditioning=none", "data.hidden=0"];
+    train(&config(&settings), &second, &dir.path().join("none"), Some(&start)).unwrap();
+    let tuned = registry::load_weights(&dir.path().join("none/model")).unwrap();
+    let count = |weights: &StoredWeights| weights.parameters.get("flow.motion.inputs.weight").is_some();
+    assert!(count(&start) && !count(&tuned));
+}
+
+#[test]
+fn nothing_is_hidden_from_a_network_that_cannot_see_speeds() {
+    let settings = ["data.hidden=0.5".to_owned()];
+    let error = TrainConfig::layered("moving-flow", None, &settings)
+        .unwrap_err()
+        .to_string();
+    assert!(
+        error.contains("data.hidden is 0.5") && error.contains("model.flow.speeds"),
+        "{error}"
+    );
+}
+
+#[test]
+fn a_model_is_adapted_to_a_recording_and_refused_if_it_became_no_better() {
+    let dir = tempfile::tempdir().unwrap();
+    let rooms = Path::new(env!("CARGO_MANIFEST_DIR")).join("models");
+    let rooms = rooms.to_str().unwrap();
+    let collected = output(
+        dir.path(),
+        &[
+            "collect",
+            "--scenario",
+            "moving-observer",
+            "--rooms",
+            "varied",
+            "--trials",
+            "12",
+            "--name",
+            "drives",
+        ],
+    );
+    assert!(collected.status.success(), "{}", text(&collected.stderr));
+    let adapt = |more: &[&str]| {
+        let settings = ["adapt", "drives", "--models-dir", rooms, "--steps"];
+        output(dir.path(), &[&settings[..], more].concat())
+    };
+    let adapted = adapt(&[
+        "2",
+        "--name",
+        "mine",
+        "--mirror",
+        "angular",
+        "--set",
+        "sequence.batch_size=2",
+    ]);
+    let said = format!("{}{}", text(&adapted.stdout), text(&adapted.stderr));
+    assert!(
+        said.contains("the last frame, copied") && said.contains("rooms as it is"),
+        "{said}"
+    );
+    let is_better = adapted.status.success();
+    assert_eq!(dir.path().join("runs/mine/model").exists(), is_better, "{said}");
+    assert!(
+        is_better || said.contains("became no better than rooms, so it was deleted"),
+        "{said}"
+    );
+    let refused = adapt(&["2", "--from", "moving-flow"]);
+    assert_eq!(refused.status.code(), Some(2));
+    assert!(
+        text(&refused.stderr).contains("start from rooms"),
+        "{}",
+        text(&refused.stderr)
+    );
+}
