@@ -33,6 +33,9 @@ pub struct Calibration {
     pub windows: usize,
     /// The error of each predicted step.
     pub steps: Vec<StepErrors>,
+    /// The same where neither state nor actions are known, for models that can do without; else empty.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub untold_steps: Vec<StepErrors>,
     /// How unlike the training data a context is.
     pub novelty: NoveltyScale,
     /// Smallest and largest value of each action channel in training; empty if the model takes no actions.
@@ -54,7 +57,9 @@ impl Calibration {
             ("actions", self.actions.len(), spec.action_inputs().unwrap_or(0)),
             ("states", self.states.len(), spec.state_inputs().unwrap_or(0)),
         ];
-        for (what, found, wanted) in lengths {
+        let untold = [("untold_steps", self.untold_steps.len(), spec.horizon)];
+        let untold = untold.into_iter().filter(|_| !self.untold_steps.is_empty());
+        for (what, found, wanted) in lengths.into_iter().chain(untold) {
             if found != wanted {
                 return Err(format!("calibration.{what} has {found} entries; it must have {wanted}"));
             }
@@ -67,7 +72,7 @@ impl Calibration {
         let is_valid_at_pose = novelty.at_pose.as_ref().is_none_or(LookAtPose::is_valid);
         let rules = [
             (
-                self.steps.iter().all(factors),
+                self.steps.iter().chain(&self.untold_steps).all(factors),
                 "steps: each step needs eight weights, a mean_factor above 0, and a low_factor of at most the high_factor",
             ),
             (square, "novelty.whitening: it must have a row for each statistic"),
@@ -282,8 +287,18 @@ impl RolloutInContext<'_> {
     #[must_use]
     pub fn expected_errors(&self, calibration: &Calibration) -> Vec<ExpectedError> {
         let inputs = self.error_inputs(&calibration.novelty);
-        let steps = calibration.steps.iter().zip(&inputs);
+        let steps = if self.is_untold() && !calibration.untold_steps.is_empty() {
+            &calibration.untold_steps
+        } else {
+            &calibration.steps
+        };
+        let steps = steps.iter().zip(&inputs);
         steps.map(|(step, inputs)| step.expected(inputs)).collect()
+    }
+
+    /// Whether the model takes actions, and none is known.
+    fn is_untold(&self) -> bool {
+        self.spec.action_inputs().is_some() && !self.actions.iter().any(|value| value.is_finite())
     }
 
     /// Root mean square of the scaled actions up to a step; 0 without actions, or if none is known.

@@ -7,7 +7,7 @@ use std::sync::atomic::AtomicBool;
 
 use super::config::EvaluateConfig;
 use super::division::Division;
-use super::forecast::{Forecast, contexts, forecasts};
+use super::forecast::{Forecast, contexts, forecasts, untold_forecasts};
 use super::inference::Inference;
 use super::least_squares::{factor, second_moments, solve};
 use super::novelty_scale::novelty_scale;
@@ -78,6 +78,7 @@ pub fn calibrate(
         dataset_content_hash: dataset.info().content_hash.clone(),
         windows: validation.len(),
         steps: Vec::new(),
+        untold_steps: Vec::new(),
         novelty: novelty_scale(&seen, &poses.collect::<Vec<_>>()),
         actions: range(spec.action_inputs(), &|frame| dataset.action(frame).to_vec()),
         states: range(spec.state_inputs(), &|frame| dataset.state(frame).to_vec()),
@@ -87,7 +88,15 @@ pub fn calibrate(
     calibration.novelty.quantiles = (0..=QUANTILE_STEPS)
         .map(|step| quantile(distances.clone(), step as f64 / QUANTILE_STEPS as f64) as f32)
         .collect();
-    calibration.steps = (0..spec.horizon).map(|step| step_errors(&found, step)).collect();
+    let steps = |found: &[Forecast]| (0..spec.horizon).map(|step| step_errors(found, step)).collect();
+    calibration.steps = steps(&found);
+    if spec.sees_speeds() && spec.action_inputs().is_some() {
+        calibration.untold_steps = steps(&untold_forecasts(
+            &evaluation(Split::Validation),
+            &validation,
+            &calibration,
+        )?);
+    }
     Ok(calibration)
 }
 

@@ -36,12 +36,12 @@ pub struct CameraEstimate {
 }
 
 /// One that was tried, with the error of each window.
-struct Tried {
+struct TriedCamera {
     degrees: [f32; 2],
     errors: Vec<f64>,
 }
 
-impl Tried {
+impl TriedCamera {
     fn mean(&self) -> f64 {
         self.errors.iter().sum::<f64>() / self.errors.len() as f64
     }
@@ -73,11 +73,11 @@ pub fn estimate_camera(
         tilt_down_rad: tilt.to_radians(),
         height_m: Some(height_m),
     };
-    let try_one = |degrees: [f32; 2]| -> Result<Tried, EvaluationError> {
+    let try_one = |degrees: [f32; 2]| -> Result<TriedCamera, EvaluationError> {
         let with_camera = dataset.clone().with_camera(camera(degrees));
         // Later steps say less: there, a prediction hedges.
         let errors = window_errors(loaded, &with_camera, &windows, 1)?;
-        Ok(Tried { degrees, errors })
+        Ok(TriedCamera { degrees, errors })
     };
     let first = FIELDS_OF_VIEW
         .into_iter()
@@ -112,7 +112,7 @@ pub fn estimate_camera(
     }))
 }
 
-fn best(tried: &[Tried]) -> &Tried {
+fn best(tried: &[TriedCamera]) -> &TriedCamera {
     let least = tried.iter().min_by(|a, b| a.mean().total_cmp(&b.mean()));
     least.expect("no camera that was tried is a bug")
 }

@@ -3,6 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::EvaluationError;
+use super::compatible::has_states_of;
 use super::inference::ActionSource;
 use super::progress::{EvaluationContext, EvaluationStage};
 use foreframe_core::registry::Model;
@@ -33,7 +34,18 @@ pub(super) fn forecasts(
     calibration: &Calibration,
 ) -> Result<Vec<Forecast>, EvaluationError> {
     evaluation.in_divided_batches(evaluation.pass(EvaluationStage::Calibration), windows, |batch| {
-        forecast_batch(evaluation, batch, calibration)
+        forecast_batch(evaluation, batch, calibration, ActionSource::Recorded)
+    })
+}
+
+/// The same without states and actions, for a model that can do without. Errors: as [`forecasts`].
+pub(super) fn untold_forecasts(
+    evaluation: &EvaluationContext,
+    windows: &[Window],
+    calibration: &Calibration,
+) -> Result<Vec<Forecast>, EvaluationError> {
+    evaluation.in_batches(EvaluationStage::Calibration, windows, |batch| {
+        forecast_batch(evaluation, batch, calibration, ActionSource::Untold)
     })
 }
 
@@ -56,11 +68,12 @@ fn forecast_batch(
     evaluation: &EvaluationContext,
     windows: &[Window],
     calibration: &Calibration,
+    source: ActionSource,
 ) -> Result<Vec<Forecast>, EvaluationError> {
     let (inference, spec) = (evaluation.inference, evaluation.inference.spec());
     let Model { manifest, network, .. } = inference.loaded;
     let (pixels, length) = (spec.pixels(), spec.code_len());
-    let predicted = inference.predict(windows, ActionSource::Recorded)?;
+    let predicted = inference.predict(windows, source)?;
     let contexts = ContextStatistics::of_codes(network, &predicted.seen, spec.context)?;
     let actions_each = predicted.actions.len() / windows.len();
     let mut found = Vec::with_capacity(windows.len());
@@ -77,7 +90,8 @@ fn forecast_batch(
             actions: &predicted.actions[index * actions_each..][..actions_each],
         };
         let expected = |calibration: &Calibration| rollout.expected_errors(calibration);
-        let distance = |state: &[f32]| calibration.distance(spec, &context, Some(state), rollout.actions);
+        let is_told = has_states_of(spec, inference.dataset);
+        let distance = |state: &[f32]| calibration.distance(spec, &context, is_told.then_some(state), rollout.actions);
         let dataset = inference.dataset;
         let start = dataset.state(dataset.episodes()[window.episode].first_frame);
         let last = dataset.state(window.first_frame + spec.context - 1);

@@ -27,6 +27,8 @@ pub(super) enum ActionSource<'a> {
     Held,
     /// Zero in every component, in the channels' own units.
     Zero,
+    /// None, and no states either: only for models that can do without.
+    Untold,
 }
 
 /// What a model predicted from a batch of windows, one window after another.
@@ -178,6 +180,10 @@ impl<'a> Inference<'a> {
         let (dataset, spec, batch) = (self.dataset, self.spec(), windows.len());
         let last = spec.context - 1;
         let mut condition = ConditioningTensors::none();
+        condition.cameras = dataset.cameras(windows.iter().map(|window| window.episode));
+        if matches!(source, ActionSource::Untold) {
+            return Ok(condition);
+        }
         if let Some(count) = spec.action_inputs().filter(|_| has_actions_of(spec, dataset)) {
             let mut actions = Vec::with_capacity(batch * spec.horizon * count);
             let acting = match source {
@@ -212,7 +218,6 @@ impl<'a> Inference<'a> {
             let earlier = earlier.map(|frame| dataset.state(frame)).collect::<Vec<_>>().concat();
             condition.past_states = Some(Tensor::from_vec(earlier, (batch, last, count), &Device::Cpu)?);
         }
-        condition.cameras = dataset.cameras(windows.iter().map(|window| window.episode));
         Ok(condition)
     }
 }

@@ -140,7 +140,11 @@ impl FlowPrediction {
             motion: joined(|part| &part.motion)?,
             movers: joined_if_given(parts, |part| part.movers.as_ref(), 0)?,
             // Parts whose states tell the speeds have none.
-            speeds: None,
+            speeds: if parts.iter().all(|part| part.speeds.is_some()) {
+                joined_if_given(parts, |part| part.speeds.as_ref(), 0)?
+            } else {
+                None
+            },
         })
     }
 }
