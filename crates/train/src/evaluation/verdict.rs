@@ -29,6 +29,21 @@ impl SetScores {
         format!("{verdict}; {} {are} too few to be sure", self.groups())
     }
 
+    /// The skill against the baselines that know nothing of the data set, for a model that was not trained on it.
+    #[doc(hidden)]
+    #[must_use]
+    pub fn verdict_against_unfitted(&self) -> Option<String> {
+        let skill = self.skill_against_unfitted.as_ref()?;
+        let interval = skill.mean_interval.map_or_else(String::new, |interval| {
+            format!(" (95 % interval: {:.3} … {:.3})", interval.low, interval.high)
+        });
+        Some(format!(
+            "against baselines that know nothing of this data set, the skill is {:.3}{interval}; the strongest of them is {}",
+            skill.skill.mean,
+            skill.best_mean_baseline.label()
+        ))
+    }
+
     /// What the windows come from: `12 trials`, `3 blocks`.
     fn groups(&self) -> String {
         let (count, unit) = match (self.trials, self.blocks) {
@@ -55,6 +70,19 @@ mod tests {
         scores.skill.mean_interval = interval.map(|(low, high)| Interval { low, high });
         scores.intervals_are_reliable = is_reliable;
         scores.verdict()
+    }
+
+    #[test]
+    fn the_second_skill_is_told_of_a_model_that_has_one() {
+        let bootstrap = Bootstrap {
+            samples: 1,
+            seed: Seed(0),
+        };
+        let mut scores = SetScores::new(&[], &[], &bootstrap, true);
+        assert_eq!(scores.verdict_against_unfitted(), None);
+        scores.skill_against_unfitted = Some(scores.skill.clone());
+        let told = scores.verdict_against_unfitted().unwrap();
+        assert!(told.ends_with("the strongest of them is copy last frame"), "{told}");
     }
 
     #[test]
