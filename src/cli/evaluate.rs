@@ -18,7 +18,6 @@ use foreframe_core::registry::{self, Model};
 use foreframe_core::types::Seed;
 use foreframe_data::dataset::Dataset;
 use foreframe_jobs::jobs::spec::MAX_RESAMPLES;
-use foreframe_train::evaluation::report::SetScores;
 use foreframe_train::evaluation::{self, EvaluateConfig, EvaluationReport, NEAREST_WINDOWS, ScoredSplit};
 
 /// The page that `--html` adds to the report.
@@ -198,8 +197,12 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<(), CliError> {
 /// The scores in a table, what they say, and where the report is.
 fn print_summary(report: &EvaluationReport, out: &Path, has_page: bool) -> Result<(), CliError> {
     print_scores(&report.headline(), "")?;
-    for (set, verdict) in verdicts(report) {
-        print_line(format!("{set}: {verdict}"))?;
+    for set in &report.sets {
+        let Some(scores) = set.outcome.scores() else { continue };
+        let verdicts = [Some(scores.verdict()), scores.verdict_against_unfitted()];
+        for verdict in verdicts.into_iter().flatten() {
+            print_line(format!("{}: {verdict}", set.split))?;
+        }
     }
     if let Some(factor) = report.stamp.brightness {
         print_line(format!(
@@ -207,11 +210,7 @@ fn print_summary(report: &EvaluationReport, out: &Path, has_page: bool) -> Resul
         ))?;
     }
     for set in &report.sets {
-        let scores = set.outcome.scores();
-        if let Some(second) = scores.and_then(SetScores::verdict_against_unfitted) {
-            print_line(format!("{}: {second}", set.split))?;
-        }
-        let scores = scores.and_then(|scores| scores.uncertainty.as_ref());
+        let scores = set.outcome.scores().and_then(|scores| scores.uncertainty.as_ref());
         if let Some(auroc) = scores.and_then(|scores| scores.wrong_origin_auroc) {
             print_line(format!(
                 "{}: novelty of poses counted from the trial's start: AUROC {auroc:.3}",

@@ -21,6 +21,11 @@ impl SetScores {
             0.0.. => format!("better than {baseline} by {percent:.0} %"),
             _ => format!("worse than {baseline} by {percent:.0} %; {ADVICE}"),
         };
+        self.with_doubt(verdict)
+    }
+
+    /// The same, with what makes it doubtful if there is something.
+    fn with_doubt(&self, verdict: String) -> String {
         if self.intervals_are_reliable {
             return verdict;
         }
@@ -37,11 +42,11 @@ impl SetScores {
         let interval = skill.mean_interval.map_or_else(String::new, |interval| {
             format!(" (95 % interval: {:.3} … {:.3})", interval.low, interval.high)
         });
-        Some(format!(
+        Some(self.with_doubt(format!(
             "against baselines that know nothing of this data set, the skill is {:.3}{interval}; the strongest of them is {}",
             skill.skill.mean,
             skill.best_mean_baseline.label()
-        ))
+        )))
     }
 
     /// What the windows come from: `12 trials`, `3 blocks`.
@@ -82,7 +87,8 @@ mod tests {
         assert_eq!(scores.verdict_against_unfitted(), None);
         scores.skill_against_unfitted = Some(scores.skill.clone());
         let told = scores.verdict_against_unfitted().unwrap();
-        assert!(told.ends_with("the strongest of them is copy last frame"), "{told}");
+        let end = "the strongest of them is copy last frame; 0 blocks are too few to be sure";
+        assert!(told.ends_with(end), "{told}");
     }
 
     #[test]
