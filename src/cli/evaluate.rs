@@ -1,6 +1,7 @@
 //! `foreframe evaluate`
 
 use std::collections::BTreeMap;
+use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 
 use clap::value_parser;
@@ -22,18 +23,23 @@ use foreframe_train::evaluation::{self, EvaluateConfig, EvaluationReport, NEARES
 /// The page that `--html` adds to the report.
 const PAGE: &str = "report.html";
 
+/// The factors of `--brightness`.
+const BRIGHTNESS: RangeInclusive<f64> = 0.1..=3.0;
+
 /// Measure a model on data that training never saw, and write a report with figures and a GIF.
 ///
 /// There are three test sets: trials, start/goal pairs (where robots drive to one goal) and controller gains that training never
 /// saw. Of rooms that are only for tests, all trials are scored. The skill is 1 − MSE / MSE
-/// of the strongest baseline: 1 is perfect, 0 is no better than the baseline. To choose between models or settings, use `--split
+/// of the strongest baseline: 1 is perfect, 0 is no better than the baseline. Some baselines learn from the training part of the
+/// data set; for a model that was not trained on it, there is a second skill, against the others. To choose between models or settings, use `--split
 /// validation`; the test sets are for the final numbers.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   foreframe evaluate --model paper --dataset static-observer --html
   foreframe evaluate --model runs/moving/model --twin runs/plain/model --out reports/moving
   foreframe evaluate --model mine@2 --dataset small --data-dir /var/lib/foreframe
-  foreframe evaluate --model runs/moving-mnist/model --dataset mnist-test-seq --split all")]
+  foreframe evaluate --model runs/moving-mnist/model --dataset mnist-test-seq --split all
+  foreframe evaluate --model donkeycar --dataset my-car --brightness 0.7 --out reports/darker")]
 pub(super) struct EvaluateArgs {
     /// The directory of a model, its name, or NAME@VERSION
     #[arg(long)]
@@ -66,6 +72,10 @@ pub(super) struct EvaluateArgs {
     /// Bootstrap resamples of the trials or blocks of time, for the intervals
     #[arg(long, default_value_t = EvaluateConfig::default().bootstrap_samples as u32, value_parser = value_parser!(u32).range(1..=MAX_RESAMPLES as i64))]
     resamples: u32,
+    /// Multiply the intensities of all frames of the scored data set, inputs and truth, by this before anything is scored, and
+    /// limit them to white: does the model still predict in darker or brighter light? From 0.1 to 3
+    #[arg(long, value_name = "FACTOR", default_value_t = 1.0, allow_negative_numbers = true, value_parser = brightness, conflicts_with = "save_scores")]
+    brightness: f64,
     /// The seed of the resamples and of the shuffled actions
     #[arg(long, default_value_t = 0)]
     seed: u64,
@@ -105,6 +115,15 @@ fn skill(text: &str) -> Result<f64, String> {
     skill.ok_or_else(|| "a skill is a number of at most 1, as in 0.2".to_owned())
 }
 
+/// Reads a factor of brightness.
+fn brightness(text: &str) -> Result<f64, String> {
+    let factor = text.parse().ok().filter(|factor| BRIGHTNESS.contains(factor));
+    factor.ok_or_else(|| {
+        let (least, most) = (BRIGHTNESS.start(), BRIGHTNESS.end());
+        format!("a brightness is a number from {least} to {most}, as in 0.7; 1 leaves the frames as they are")
+    })
+}
+
 pub(super) fn run(args: &EvaluateArgs) -> Result<(), CliError> {
     let workspace = Workspace::new(args.settings.start()?);
     let (model_dir, loaded) = workspace.load_model(&args.model)?;
@@ -118,7 +137,10 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<(), CliError> {
         .clone()
         .unwrap_or_else(|| PathBuf::from("reports").join(&loaded.manifest.name));
     let dataset = args.dataset.clone().map_or_else(|| trained_on(&loaded), Ok)?;
-    let (_, dataset) = workspace.open_dataset(&dataset)?;
+    let (_, mut dataset) = workspace.open_dataset(&dataset)?;
+    if args.brightness != 1.0 {
+        dataset = dataset.with_brightness(args.brightness);
+    }
     let novel = args
         .novel_dataset
         .iter()
@@ -175,8 +197,17 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<(), CliError> {
 /// The scores in a table, what they say, and where the report is.
 fn print_summary(report: &EvaluationReport, out: &Path, has_page: bool) -> Result<(), CliError> {
     print_scores(&report.headline(), "")?;
-    for (set, verdict) in verdicts(report) {
-        print_line(format!("{set}: {verdict}"))?;
+    for set in &report.sets {
+        let Some(scores) = set.outcome.scores() else { continue };
+        let verdicts = [Some(scores.verdict()), scores.verdict_against_unfitted()];
+        for verdict in verdicts.into_iter().flatten() {
+            print_line(format!("{}: {verdict}", set.split))?;
+        }
+    }
+    if let Some(factor) = report.stamp.brightness {
+        print_line(format!(
+            "brightness: all frames were multiplied by {factor} and limited to white"
+        ))?;
     }
     for set in &report.sets {
         let scores = set.outcome.scores().and_then(|scores| scores.uncertainty.as_ref());
@@ -205,6 +236,7 @@ fn as_json(report: &EvaluationReport, out: &Path) -> Value {
     json!({
         "model": report.stamp.model,
         "dataset": report.stamp.dataset,
+        "brightness": report.stamp.brightness.unwrap_or(1.0),
         "sets": report.headline(),
         "verdicts": verdicts(report).collect::<BTreeMap<_, _>>(),
         "novelty": report.novelty,

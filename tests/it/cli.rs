@@ -516,6 +516,11 @@ fn an_evaluation_s_numbers_have_limits() {
         ("--resamples", "0", "0 is not in 1..=10000"),
         ("--min-skill", "nan", "a skill is a number of at most 1"),
         ("--min-skill", "5", "a skill is a number of at most 1"),
+        ("--brightness", "0", "a brightness is a number from 0.1 to 3"),
+        ("--brightness", "-1", "a brightness is a number from 0.1 to 3"),
+        ("--brightness", "3.1", "a brightness is a number from 0.1 to 3"),
+        ("--brightness", "nan", "a brightness is a number from 0.1 to 3"),
+        ("--brightness", "dark", "a brightness is a number from 0.1 to 3"),
     ] {
         let refused = output(dir.path(), &["evaluate", "--model", "plain", option, value]);
         let error = text(&refused.stderr);
@@ -599,6 +604,18 @@ fn collect_train_and_evaluate_share_default_directories() {
     let printed: Value = serde_json::from_str(&printed).unwrap();
     assert!(printed["sets"]["test"]["skill"].as_f64().unwrap() < 0.0, "{printed}");
     assert_eq!(printed["report"], "again/report.json");
+    assert_eq!(printed["brightness"], 1.0);
+    let dark = "evaluate --model runs/paper/model --resamples 100 --windows 5 --brightness 0.5";
+    let told = succeed(dir.path(), &format!("{dark} --out dark"));
+    assert!(
+        told.contains("\nbrightness: all frames were multiplied by 0.5"),
+        "{told}"
+    );
+    let dark_scores: Value = serde_json::from_str(&succeed(dir.path(), &format!("{dark} --json --out dark2"))).unwrap();
+    assert_eq!(dark_scores["brightness"], 0.5);
+    assert_ne!(dark_scores["sets"]["test"]["mse"], printed["sets"]["test"]["mse"]);
+    let (code, text) = run(dir.path(), &format!("{dark} --save-scores --out dark3"));
+    assert!(code == 2 && text.contains("--save-scores"), "{text}");
     assert!(dir.path().join("again/report.html").is_file());
     assert!(scores.ends_with("report: reports/paper/report.md\n"), "{scores}");
     let described = succeed(dir.path(), "inspect runs/paper/model");

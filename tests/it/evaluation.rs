@@ -223,6 +223,15 @@ fn on_simulated_data_trials_and_gains_are_scored_and_plans_are_compared() {
         // Random weights answer to actions at random.
         assert!(plans.rate < 0.8, "{}", plans.rate);
     }
+    // The frames of the simulator are changed as those of the data set.
+    let brighter = evaluate(&model, &dataset.clone().with_brightness(1.7), &config()).unwrap();
+    let brighter = brighter.scores("test").unwrap();
+    assert!(
+        matches!(&brighter.plans, Some(PlanOutcome::Measured(_))),
+        "{:?}",
+        brighter.plans
+    );
+    assert!(brighter.visibility.is_some());
     let figures = evaluation::draw_figures(&model, &dataset, &report).unwrap();
     let files = figures.iter().map(|figure| figure.about.file.as_str());
     let predictions: Vec<&str> = files.filter(|file| file.starts_with("prediction-")).collect();
@@ -272,6 +281,89 @@ fn rooms_that_are_only_for_tests_are_scored_as_a_whole() {
     )
     .unwrap();
     assert_eq!(report.stamp.split, ScoredSplit::Test);
+}
+
+#[test]
+fn all_frames_can_be_darker() {
+    let dataset = moving_squares(40, SIDE, 0.2);
+    let model = untrained("still", spec(Conditioning::None), &dataset);
+    let darker = dataset.clone().with_brightness(0.5);
+    assert_eq!(darker.mask(3).unwrap(), dataset.mask(3).unwrap());
+    let [usual, dark] = [&dataset, &darker].map(|dataset| evaluate(&model, dataset, &config()).unwrap());
+    let mse = |report: &EvaluationReport, method| {
+        let rows = &report.scores("test").unwrap().methods;
+        rows.iter().find(|row| row.method == method).unwrap().mse.mean
+    };
+    // Half the differences are a quarter of the squares, but for rounding.
+    for method in [Method::CopyLast, Method::MeanTrainingFrame, Method::EgoMotion] {
+        let ratio = mse(&dark, method) / mse(&usual, method);
+        assert!((ratio - 0.25).abs() < 0.02, "{method:?} {ratio}");
+    }
+    let [own, own_dark] = [&usual, &dark].map(|report| mse(report, Method::Model));
+    assert!((own - own_dark).abs() > 0.1 * own, "{own} {own_dark}");
+    assert_eq!((usual.stamp.brightness, dark.stamp.brightness), (None, Some(0.5)));
+    assert!(!usual.to_markdown().contains("brightness"));
+    let markdown = dark.to_markdown();
+    assert!(
+        markdown.contains("inputs and truth, were multiplied by 0.5") && markdown.contains("| brightness |"),
+        "{markdown}"
+    );
+    let json = serde_json::to_value(&dark).unwrap();
+    assert_eq!(json["stamp"]["brightness"], 0.5);
+    assert_eq!(serde_json::from_value::<EvaluationReport>(json).unwrap(), dark);
+    // It is still the data set of the training.
+    assert_eq!(dark.stamp.dataset_content_hash, usual.stamp.dataset_content_hash);
+    let whole = EvaluateConfig {
+        split: ScoredSplit::WholeSet,
+        ..config()
+    };
+    assert!(refusal(&model, &darker, &whole).contains("was trained on data set"));
+}
+
+#[test]
+fn a_model_trained_elsewhere_has_a_second_skill() {
+    let dataset = moving_squares(40, SIDE, 0.2);
+    let own = untrained("own", spec(Conditioning::None), &dataset);
+    let stranger = untrained("other", spec(Conditioning::None), &moving_squares(20, SIDE, 0.2));
+    let [own, other] = [&own, &stranger].map(|model| evaluate(model, &dataset, &config()).unwrap());
+    let scores = own.scores("test").unwrap();
+    assert_eq!(scores.skill_against_unfitted, None);
+    assert!(!own.to_markdown().contains("know nothing") && own.headline()["test"]["skill_against_unfitted"].is_null());
+
+    let scores = other.scores("test").unwrap();
+    let second = scores.skill_against_unfitted.as_ref().unwrap();
+    assert_eq!(scores.skill.best_mean_baseline, Method::NearestWindows);
+    let unfitted = [
+        Method::CopyLast,
+        Method::MeanOfInputs,
+        Method::LinearExtrapolation,
+        Method::ConstantShift,
+    ];
+    let errors = scores.methods.iter().filter(|row| unfitted.contains(&row.method));
+    let strongest = errors
+        .min_by(|one, other| one.mse.mean.total_cmp(&other.mse.mean))
+        .unwrap();
+    assert_eq!(second.best_mean_baseline, strongest.method);
+    let expected = 1.0 - scores.methods[0].mse.mean / strongest.mse.mean;
+    assert!((second.against_best_mean - expected).abs() < 1e-9);
+    assert!(second.best_baseline.iter().all(|method| unfitted.contains(method)));
+    let steps = second.skill.per_step.iter().zip(&scores.skill.skill.per_step);
+    assert!(steps.into_iter().all(|(second, first)| second >= first));
+    assert!(second.skill.mean > scores.skill.skill.mean);
+    let interval = second.mean_interval.unwrap();
+    assert!(interval.low <= second.skill.mean && second.skill.mean <= interval.high);
+    let markdown = other.to_markdown();
+    let line = format!(
+        "- Test part: against baselines that know nothing of this data set, the skill is {:.3} (95 % interval: ",
+        second.skill.mean
+    );
+    assert!(
+        markdown.contains(&line) && markdown.contains("The model was not trained on this data set"),
+        "{markdown}"
+    );
+    let headline = &other.headline()["test"];
+    assert_eq!(headline["skill_against_unfitted"], second.skill.mean);
+    assert_eq!(headline["strongest_unfitted_baseline"], json!(strongest.method));
 }
 
 #[test]

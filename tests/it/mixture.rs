@@ -37,6 +37,28 @@ fn part(name: &str, episodes: usize, change: impl FnOnce(&mut DatasetInfo)) -> D
 }
 
 #[test]
+fn the_frames_of_joined_data_sets_can_be_darker() {
+    let (first, second) = (moving_squares(12, 12, 0.2), part("second", 20, |_| {}));
+    let half = |pixels: &[u8]| -> Vec<u8> { pixels.iter().map(|&pixel| pixel.div_ceil(2)).collect() };
+    let join = |first: Dataset| Dataset::join(vec![(first, 1.0), (second.clone(), 1.0)], Lacking::NotKnown).unwrap();
+    let (one_darker, all_darker) = (
+        join(first.clone().with_brightness(0.5)),
+        join(first.clone()).with_brightness(0.5),
+    );
+    let offset = first.info().frame_count;
+    assert_eq!(*one_darker.pixels(5).unwrap(), half(&first.pixels(5).unwrap()));
+    assert_eq!(one_darker.pixels(offset + 5).unwrap(), second.pixels(5).unwrap());
+    assert_eq!(
+        *all_darker.pixels(offset + 5).unwrap(),
+        half(&second.pixels(5).unwrap())
+    );
+    for darker in [one_darker, all_darker] {
+        assert_eq!(darker.mask(5).unwrap(), first.mask(5).unwrap());
+        assert_eq!(darker.mask(offset + 5).unwrap(), None);
+    }
+}
+
+#[test]
 fn joined_data_sets_keep_their_frames_and_splits() {
     let (first, second) = (moving_squares(12, 12, 0.2), part("second", 20, |_| {}));
     let joined = Dataset::join(vec![(first.clone(), 1.0), (second.clone(), 3.0)], Lacking::Refused).unwrap();

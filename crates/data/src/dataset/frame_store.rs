@@ -1,10 +1,12 @@
-//! The frames of an open data set: all in memory, or in a file of decoded frames.
+//! The frames of an open data set: all in memory, or in a file of decoded frames; in another light if asked for.
 
+mod brightness;
 pub(super) mod frame_file;
 
 use std::borrow::Cow;
 use std::sync::Arc;
 
+use self::brightness::Brightness;
 use self::frame_file::FrameFile;
 use super::DatasetError;
 
@@ -36,6 +38,8 @@ pub(super) enum FrameStore {
     File(Arc<FrameFile>),
     /// Those of joined data sets.
     Joined(Vec<JoinedStore>),
+    /// Those of another store in another light.
+    Changed(Box<ChangedStore>),
 }
 
 /// The images of one of several joined data sets.
@@ -48,7 +52,45 @@ pub(super) struct JoinedStore {
     pub(super) images: FrameStore,
 }
 
+/// Images whose frames are changed when they are read; their masks are as they were.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct ChangedStore {
+    images: FrameStore,
+    frame_count: usize,
+    brightness: Brightness,
+}
+
 impl FrameStore {
+    /// The same with frames, the first `frame_count` images, whose intensities are multiplied by this factor instead of any
+    /// earlier one.
+    pub(super) fn with_brightness(self, factor: f64, frame_count: usize) -> Self {
+        let images = match self {
+            Self::Changed(changed) => changed.images,
+            images => images,
+        };
+        Self::Changed(Box::new(ChangedStore {
+            images,
+            frame_count,
+            brightness: Brightness::new(factor),
+        }))
+    }
+
+    /// What the frames' intensities are multiplied by.
+    pub(super) fn brightness(&self) -> f64 {
+        match self {
+            Self::Changed(changed) => changed.brightness.factor,
+            _ => 1.0,
+        }
+    }
+
+    /// These intensities in the light of the frames.
+    pub(super) fn changed<'a>(&self, pixels: Cow<'a, [u8]>) -> Cow<'a, [u8]> {
+        match self {
+            Self::Changed(changed) => Cow::Owned(changed.brightness.of(&pixels)),
+            _ => pixels,
+        }
+    }
+
     /// The pixels of an image: borrowed from memory, or read from the file. Panics if there is no such image.
     pub(super) fn read(&self, image: usize) -> Result<Cow<'_, [u8]>, DatasetError> {
         match self {
@@ -61,6 +103,14 @@ impl FrameStore {
                 let masks = if is_mask { part.frame_count } else { 0 };
                 part.images.read(masks + frame - part.first_frame)
             }
+            Self::Changed(changed) => {
+                let stored = changed.images.read(image)?;
+                Ok(if image < changed.frame_count {
+                    self.changed(stored)
+                } else {
+                    stored
+                })
+            }
         }
     }
 
@@ -69,6 +119,7 @@ impl FrameStore {
         match self {
             Self::Memory(_) | Self::File(_) => true,
             Self::Joined(parts) => parts[parts.partition_point(|part| part.first_frame <= frame) - 1].has_masks,
+            Self::Changed(changed) => changed.images.has_mask(frame),
         }
     }
 
@@ -78,6 +129,7 @@ impl FrameStore {
             Self::Memory(images) => images.iter().map(|image| image.len()).sum(),
             Self::File(_) => 0,
             Self::Joined(parts) => parts.iter().map(|part| part.images.bytes_in_memory()).sum(),
+            Self::Changed(changed) => changed.images.bytes_in_memory(),
         }
     }
 }

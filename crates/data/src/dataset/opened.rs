@@ -163,6 +163,29 @@ impl Dataset {
         self
     }
 
+    /// The same in darker or brighter light: the intensities of all frames are multiplied by `factor`, above 0, and limited to
+    /// white. Masks, numbers and the content hash stay; a factor that was given before does not count.
+    #[doc(hidden)]
+    #[must_use]
+    pub fn with_brightness(mut self, factor: f64) -> Self {
+        self.images = self.images.with_brightness(factor, self.info.frame_count);
+        self
+    }
+
+    /// What the intensities of the stored frames are multiplied by; 1 unless another brightness was asked for.
+    #[doc(hidden)]
+    #[must_use]
+    pub fn brightness(&self) -> f64 {
+        self.images.brightness()
+    }
+
+    /// A frame from elsewhere, for example from the simulator, in the light of this data set's frames.
+    #[doc(hidden)]
+    #[must_use]
+    pub fn in_its_light<'a>(&self, pixels: &'a [u8]) -> Cow<'a, [u8]> {
+        self.images.changed(Cow::Borrowed(pixels))
+    }
+
     /// The camera of each of the episodes, given by position; empty if none is known. Where only some are, the others are taken to
     /// be the usual one.
     pub fn cameras(&self, episodes: impl IntoIterator<Item = usize>) -> Vec<CameraModel> {

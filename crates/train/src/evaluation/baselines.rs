@@ -117,6 +117,16 @@ impl Baselines {
         &self.methods
     }
 
+    /// Whether a baseline learned what the place or the car of this data set is like, from its training split. One number, the
+    /// distance of the wall for the two baselines with a floor and a wall, does not count.
+    pub(super) fn knows_dataset(&self, method: Method) -> bool {
+        match method {
+            Method::MeanTrainingFrame | Method::MovingCutOut | Method::NearestWindows => true,
+            Method::EgoMotion => matches!(self.ego_motion, Some(EgoMotion::Flow(_))),
+            _ => false,
+        }
+    }
+
     /// What the nearest windows are searched among, if that baseline applies.
     pub(super) fn nearest_summary(&self) -> Option<NearestSummary> {
         self.nearest.as_ref().map(NearestWindows::summary)

@@ -121,6 +121,7 @@ pub(super) fn inputs(inference: Inference, config: &EvaluateConfig, split_seed: 
         "model": of_model(inference.loaded),
         "twins": config.twins.iter().map(|twin| of_model(twin)).collect::<Vec<_>>(),
         "dataset": inference.dataset.info(),
+        "brightness": inference.dataset.brightness(),
         "split": config.split,
         "split_seed": split_seed,
         "stride": config.stride,

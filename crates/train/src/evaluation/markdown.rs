@@ -8,7 +8,7 @@ use super::bootstrap::{CONFIDENCE, FEWEST_GROUPS};
 use super::method::Method;
 use super::metrics::PSNR_CAP_DB;
 use super::pixel_class::PixelClass;
-use super::report::{EvaluationReport, SetScores};
+use super::report::{EvaluationReport, SetReport, SetScores};
 
 /// Squared errors are shown in this unit.
 const MSE_UNIT: f64 = 1e-4;
@@ -28,12 +28,14 @@ impl EvaluationReport {
         environment.add_filter("pixel_class", |class: ViaDeserialize<PixelClass>| class.label());
         environment.add_filter("variant", |variant: ViaDeserialize<Variant>| variant.label());
         let verdicts = self.sets.iter().map(|set| set.outcome.scores().map(SetScores::verdict));
+        let second = |set: &SetReport| set.outcome.scores()?.verdict_against_unfitted();
         let report = Value::from_serialize(self);
         let context = context! {
             psnr_cap_db => PSNR_CAP_DB,
             confidence => CONFIDENCE,
             fewest_groups => FEWEST_GROUPS,
             verdicts => verdicts.collect::<Vec<_>>(),
+            verdicts_against_unfitted => self.sets.iter().map(second).collect::<Vec<_>>(),
             ..report
         };
         environment

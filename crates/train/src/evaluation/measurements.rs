@@ -12,6 +12,7 @@ use super::progress::EvaluationContext;
 use super::ranking;
 use super::report::SetScores;
 use super::score::score;
+use super::skill::skill_against;
 use super::surroundings::{self, SurroundingsMeasurements};
 use super::uncertainty;
 use super::visibility;
@@ -73,6 +74,12 @@ impl Measurements {
         let (inference, bootstrap) = (evaluation.inference, evaluation.config.bootstrap());
         let is_recording = is_recording(inference.dataset);
         let mut scores = SetScores::new(baselines.methods(), &self.scores, &bootstrap, is_recording);
+        let trained_on = &inference.loaded.manifest.dataset;
+        if !trained_on.includes(&inference.dataset.info().content_hash) {
+            let knows_nothing = |method| !baselines.knows_dataset(method);
+            let skill = skill_against(knows_nothing, baselines.methods(), &self.scores, &bootstrap);
+            scores.skill_against_unfitted = Some(skill);
+        }
         if baselines.are_of_benchmark() {
             add_benchmark(&mut scores.methods, &self.scores, inference.spec().pixels());
         }

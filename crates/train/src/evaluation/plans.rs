@@ -165,7 +165,8 @@ fn true_frames_of(
         let mut truth = Vec::with_capacity(spec.horizon * spec.pixels());
         for frame in first_action..first_action + spec.horizon {
             let result = branch.step(&action(inference.dataset, frame)?)?;
-            truth.extend(scale(result.observation.frame.pixels()));
+            let pixels = result.observation.frame.pixels();
+            truth.extend(scale(&inference.dataset.in_its_light(pixels)));
         }
         truths.push(truth);
     }

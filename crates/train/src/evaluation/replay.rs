@@ -84,7 +84,8 @@ fn replayed_to(
 /// Whether a replayed frame is not the recorded one.
 fn differs(replayed: &Frame, dataset: &Dataset, frame: usize) -> Result<bool, EvaluationError> {
     let recorded = true_frame(dataset, frame)?;
-    Ok(quality::mse(&scale(replayed.pixels()), &recorded) > REPLAY_TOLERANCE)
+    let replayed = scale(&dataset.in_its_light(replayed.pixels()));
+    Ok(quality::mse(&replayed, &recorded) > REPLAY_TOLERANCE)
 }
 
 /// Whether frames need no resizing, which masks and depths do not get.

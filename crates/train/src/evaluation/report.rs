@@ -78,6 +78,13 @@ impl EvaluationReport {
                 Some(blocks) => summary["blocks"] = json!(blocks),
                 None => summary["trials"] = json!(scores.trials),
             }
+            if let Some(skill) = &scores.skill_against_unfitted {
+                let interval = skill.mean_interval.as_ref();
+                summary["skill_against_unfitted"] = json!(skill.skill.mean);
+                summary["strongest_unfitted_baseline"] = json!(skill.best_mean_baseline);
+                summary["skill_against_unfitted_interval_95"] =
+                    json!(interval.map(|interval| [interval.low, interval.high]));
+            }
             if let Some(benchmark) = &model.benchmark {
                 summary["squared_error_per_frame"] = json!(benchmark.squared_error.mean);
                 summary["ssim_even_windows"] = json!(benchmark.ssim.mean);
@@ -107,6 +114,10 @@ pub struct ReportStamp {
     /// Whether the validation split or the test sets were scored.
     #[serde(default)]
     pub split: ScoredSplit,
+    /// What the intensities of all frames were multiplied by before anything was scored; absent where it is 1.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[doc(hidden)]
+    pub brightness: Option<f64>,
     /// The program's version and the commit it was built from.
     pub program: ProgramStamp,
     /// The command line.
@@ -127,7 +138,8 @@ pub struct ReportStamp {
 
 impl ReportStamp {
     pub(super) fn new(evaluation: &EvaluationContext, split_seed: Seed, wall_time: Duration) -> Self {
-        let (info, config) = (evaluation.inference.dataset.info(), evaluation.config);
+        let (dataset, config) = (evaluation.inference.dataset, evaluation.config);
+        let (info, brightness) = (dataset.info(), dataset.brightness());
         let named = |model: &Model| (model.manifest.name.clone(), model.manifest.weights_sha256.clone());
         let (model, model_sha256) = named(evaluation.inference.loaded);
         Self {
@@ -138,6 +150,7 @@ impl ReportStamp {
             model_sha256,
             twins: config.twins.iter().map(|twin| named(twin)).collect(),
             split: config.split,
+            brightness: (brightness != 1.0).then_some(brightness),
             program: ProgramStamp::current(),
             command: config.command.clone(),
             stride: config.stride,
@@ -269,6 +282,11 @@ pub struct SetScores {
     pub intervals_are_reliable: bool,
     /// The headline.
     pub skill: Skill,
+    /// The skill against only those baselines that know nothing of this data set, because they learned nothing from its
+    /// training part. Absent for a model that was trained on the data set.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[doc(hidden)]
+    pub skill_against_unfitted: Option<Skill>,
     /// Model, baselines and codec.
     pub methods: Vec<MethodScores>,
     /// Mean squared error of the model in its own space (smoothed, and inverted if the model inverts); not comparable
@@ -315,6 +333,7 @@ impl SetScores {
             blocks: is_recording.then_some(groups),
             intervals_are_reliable: groups >= FEWEST_GROUPS,
             skill: skill(methods, windows, bootstrap),
+            skill_against_unfitted: None,
             methods: summarize(methods, windows),
             model_space_mse: StepCurve::new(own_space.means()),
             reconstruction_mse: StepCurve::new(by_trial(|window| &window.reconstruction_mse).means()),

@@ -24,12 +24,27 @@ pub struct Skill {
     pub against_best_mean: f64,
 }
 
-/// The skill of the model over these windows, whose rows are the model, the baselines and perhaps the codec.
+/// The skill of the model over these windows, whose rows are these methods: the model, the baselines and perhaps the codec.
 pub(super) fn skill(methods: &[Method], windows: &[WindowScores], bootstrap: &Bootstrap) -> Skill {
-    let baselines: Vec<Method> = methods.iter().copied().filter(|method| method.is_baseline()).collect();
-    let rows = 1 + baselines.len();
+    skill_against(Method::is_baseline, methods, windows, bootstrap)
+}
+
+/// The same against only those of the baselines that count.
+pub(super) fn skill_against(
+    counts: impl Fn(Method) -> bool,
+    methods: &[Method],
+    windows: &[WindowScores],
+    bootstrap: &Bootstrap,
+) -> Skill {
+    let numbered = methods.iter().copied().enumerate();
+    let (places, baselines): (Vec<usize>, Vec<Method>) = numbered
+        .filter(|&(_, method)| method.is_baseline() && counts(method))
+        .unzip();
+    // The first row is the model's.
+    let places: Vec<usize> = [0].into_iter().chain(places).collect();
+    let rows = places.len();
     let errors_by_row = |window: &WindowScores| -> Vec<f64> {
-        let rows = window.frames.iter().take(rows);
+        let rows = places.iter().filter_map(|&place| window.frames.get(place));
         rows.flat_map(|steps| steps.iter().map(|score| score.mse)).collect()
     };
     let trial_of: Vec<usize> = windows.iter().map(|window| window.group).collect();
@@ -141,6 +156,22 @@ mod tests {
         assert!(same.skill.mean.abs() < 1e-12 && same.against_best_mean.abs() < 1e-12);
         let worse = skill(&Method::ALL, &windows(|difficulty| 0.2 * difficulty), &BOOTSTRAP);
         assert!(worse.skill.mean < 0.0);
+    }
+
+    #[test]
+    fn only_baselines_that_count_are_compared_each_with_its_own_row() {
+        let windows = windows(|difficulty| 0.1 * difficulty);
+        // Row 7 errs by 0.7, row 9 by 0.9.
+        let [kept, weaker] = [Method::ALL[7], Method::ALL[9]];
+        let few = skill_against(
+            |method| method == kept || method == weaker,
+            &Method::ALL,
+            &windows,
+            &BOOTSTRAP,
+        );
+        assert_eq!((few.best_mean_baseline, &*few.best_baseline), (kept, &[kept; 2][..]));
+        assert!((few.skill.mean - (1.0 - 0.1 / 0.7)).abs() < 1e-12, "{few:?}");
+        assert!(few.skill.mean >= skill(&Method::ALL, &windows, &BOOTSTRAP).skill.mean);
     }
 
     #[test]

@@ -21,12 +21,32 @@ impl SetScores {
             0.0.. => format!("better than {baseline} by {percent:.0} %"),
             _ => format!("worse than {baseline} by {percent:.0} %; {ADVICE}"),
         };
+        self.with_doubt(verdict)
+    }
+
+    /// The same, with what makes it doubtful if there is something.
+    fn with_doubt(&self, verdict: String) -> String {
         if self.intervals_are_reliable {
             return verdict;
         }
         let is_one = self.trials.or(self.blocks) == Some(1);
         let are = if is_one { "is" } else { "are" };
         format!("{verdict}; {} {are} too few to be sure", self.groups())
+    }
+
+    /// The skill against the baselines that know nothing of the data set, for a model that was not trained on it.
+    #[doc(hidden)]
+    #[must_use]
+    pub fn verdict_against_unfitted(&self) -> Option<String> {
+        let skill = self.skill_against_unfitted.as_ref()?;
+        let interval = skill.mean_interval.map_or_else(String::new, |interval| {
+            format!(" (95 % interval: {:.3} … {:.3})", interval.low, interval.high)
+        });
+        Some(self.with_doubt(format!(
+            "against baselines that know nothing of this data set, the skill is {:.3}{interval}; the strongest of them is {}",
+            skill.skill.mean,
+            skill.best_mean_baseline.label()
+        )))
     }
 
     /// What the windows come from: `12 trials`, `3 blocks`.
@@ -55,6 +75,20 @@ mod tests {
         scores.skill.mean_interval = interval.map(|(low, high)| Interval { low, high });
         scores.intervals_are_reliable = is_reliable;
         scores.verdict()
+    }
+
+    #[test]
+    fn the_second_skill_is_told_of_a_model_that_has_one() {
+        let bootstrap = Bootstrap {
+            samples: 1,
+            seed: Seed(0),
+        };
+        let mut scores = SetScores::new(&[], &[], &bootstrap, true);
+        assert_eq!(scores.verdict_against_unfitted(), None);
+        scores.skill_against_unfitted = Some(scores.skill.clone());
+        let told = scores.verdict_against_unfitted().unwrap();
+        let end = "the strongest of them is copy last frame; 0 blocks are too few to be sure";
+        assert!(told.ends_with(end), "{told}");
     }
 
     #[test]
