@@ -75,21 +75,8 @@ impl Dataset {
                 share: weight / sum,
             });
         }
-        let names: Vec<&str> = parts.iter().map(|part| part.info.name.as_str()).collect();
-        let info = DatasetInfo {
-            name: names.join("+"),
-            has_masks: match lacking {
-                Lacking::Refused => parts.iter().all(|part| part.info.has_masks),
-                Lacking::NotKnown => parts.iter().any(|part| part.info.has_masks),
-            },
-            camera: first
-                .camera
-                .filter(|camera| parts.iter().all(|part| part.info.camera == Some(*camera))),
-            content_hash: format!("{:x}", hasher.finalize()),
-            frame_count: content.timestamps_s.len(),
-            episode_count: episodes.len(),
-            ..first
-        };
+        let counts = [content.timestamps_s.len(), episodes.len()];
+        let info = joined_info(first, &parts, lacking, counts, format!("{:x}", hasher.finalize()));
         Ok(Self {
             info,
             parts,
@@ -99,6 +86,31 @@ impl Dataset {
             states: content.states,
             timestamps_s: content.timestamps_s,
         })
+    }
+}
+
+/// The description of the whole: that of the first part, with these numbers of frames and episodes.
+fn joined_info(
+    first: DatasetInfo,
+    parts: &[DatasetPart],
+    lacking: Lacking,
+    [frame_count, episode_count]: [usize; 2],
+    content_hash: String,
+) -> DatasetInfo {
+    let names: Vec<&str> = parts.iter().map(|part| part.info.name.as_str()).collect();
+    DatasetInfo {
+        name: names.join("+"),
+        has_masks: match lacking {
+            Lacking::Refused => parts.iter().all(|part| part.info.has_masks),
+            Lacking::NotKnown => parts.iter().any(|part| part.info.has_masks),
+        },
+        camera: first
+            .camera
+            .filter(|camera| parts.iter().all(|part| part.info.camera == Some(*camera))),
+        content_hash,
+        frame_count,
+        episode_count,
+        ..first
     }
 }
 

@@ -141,23 +141,6 @@ fn layer_sizes(spec: &ModelSpec, flow: &FlowSpec) -> Vec<LayerSize> {
             layer("affine", 3, 6, horizon);
         }
     }
-    if sizes.speeds {
-        layer(
-            "speeds.halving",
-            TAPS * speed_channels(sizes.frames_read),
-            SPEED_CHANNELS,
-            quarter,
-        );
-        for index in 0..2 {
-            layer(
-                &format!("speeds.{index}"),
-                TAPS * SPEED_CHANNELS,
-                SPEED_CHANNELS,
-                quarter,
-            );
-        }
-        layer("speeds.votes", SPEED_CHANNELS, VOTE_VALUES, quarter);
-    }
     let moving = if actions.is_some() || sizes.speeds { 3 } else { 0 };
     let told = known + horizon + moving;
     layer("modulation.inputs", told, MODULATION_HIDDEN, horizon);
@@ -171,14 +154,8 @@ fn layer_sizes(spec: &ModelSpec, flow: &FlowSpec) -> Vec<LayerSize> {
         layer("scene.hidden", sizes.scene_hidden, sizes.scene_hidden, rows);
         layer("scene.output", sizes.scene_hidden, SCENE_CHANNELS, rows);
     }
-    if sizes.depth {
-        layer("depth.enlarge", channels, 4 * sizes.enlarged_channels, quarter);
-        let read = TAPS * (sizes.enlarged_channels + sizes.stem_channels);
-        layer("depth.output", read, 4, half);
-    }
-    if sizes.movers {
-        layer("movers.seen", channels, FRAME_CHANNELS, quarter);
-        layer("movers.coming", channels, FRAME_CHANNELS, horizon * quarter);
+    for (name, inputs, outputs, rows) in seeing_layers(sizes, [half, quarter], horizon) {
+        layer(name, inputs, outputs, rows);
     }
     layer(
         mix_name(sizes),
@@ -197,5 +174,32 @@ fn layer_sizes(spec: &ModelSpec, flow: &FlowSpec) -> Vec<LayerSize> {
     let fine = sizes.enlarged_channels + MOVED_CHANNELS + beside;
     layer("fine", TAPS * fine, sizes.fine_channels, horizon * half);
     layer("head", TAPS * sizes.fine_channels, 4 * HEAD_VALUES, horizon * half);
+    layers
+}
+
+/// The layers that see depth, movers and speeds: name, inputs, outputs and rows of each, on the grids of half and of a quarter of the
+/// sides.
+fn seeing_layers(
+    sizes: &FlowLayers,
+    [half, quarter]: [usize; 2],
+    horizon: usize,
+) -> Vec<(&'static str, usize, usize, usize)> {
+    let (channels, enlarged) = (sizes.channels, sizes.enlarged_channels);
+    let mut layers = Vec::new();
+    if sizes.depth {
+        layers.push(("depth.enlarge", channels, 4 * enlarged, quarter));
+        layers.push(("depth.output", TAPS * (enlarged + sizes.stem_channels), 4, half));
+    }
+    if sizes.movers {
+        layers.push(("movers.seen", channels, FRAME_CHANNELS, quarter));
+        layers.push(("movers.coming", channels, FRAME_CHANNELS, horizon * quarter));
+    }
+    if sizes.speeds {
+        let read = TAPS * speed_channels(sizes.frames_read);
+        layers.push(("speeds.halving", read, SPEED_CHANNELS, quarter));
+        layers.push(("speeds.0", TAPS * SPEED_CHANNELS, SPEED_CHANNELS, quarter));
+        layers.push(("speeds.1", TAPS * SPEED_CHANNELS, SPEED_CHANNELS, quarter));
+        layers.push(("speeds.votes", SPEED_CHANNELS, VOTE_VALUES, quarter));
+    }
     layers
 }

@@ -69,22 +69,11 @@ impl MotionHead {
         let spec = rows.spec;
         let shape = (rows.count(), spec.horizon, 3);
         let Some(layers) = &self.layers else {
-            return self.seen_ahead(rows, Tensor::zeros(shape, DType::F32, &Device::Cpu)?);
+            return seen_ahead(rows, Tensor::zeros(shape, DType::F32, &Device::Cpu)?);
         };
         let correction = (perceptron(layers, &rows.scaled()?)?.reshape(shape)? * CORRECTION)?;
         let correction = told_only(&correction, &rows.tell_anything())?;
-        Ok((self.seen_ahead(rows, self.integral(rows)?)? + correction)?)
-    }
-
-    /// The motion, and for rollouts of which nothing tells a speed, that of a camera that goes on as fast as the frames show.
-    pub(super) fn seen_ahead(&self, rows: &RolloutRows, motion: Tensor) -> Result<Tensor, NnError> {
-        let told = rows.told_speeds();
-        let Some(seen) = rows.seen_speeds().filter(|_| !told.iter().all(|told| *told)) else {
-            return Ok(motion);
-        };
-        let untold: Vec<bool> = told.iter().map(|told| !told).collect();
-        let arcs = arcs(&seen.tensor, rows.spec.horizon, rows.spec.frame_period_s)?;
-        Ok((told_only(&motion, &told)? + told_only(&arcs, &untold)?)?)
+        Ok((seen_ahead(rows, self.integral(rows)?)? + correction)?)
     }
 
     /// The motion of a base that follows its commands `[N, horizon, 3]`, on the CPU.
@@ -122,6 +111,17 @@ impl MotionHead {
         let moved = basis.matmul(&map)?.broadcast_mul(&sides)?;
         Ok(Some(moved.broadcast_add(own)?))
     }
+}
+
+/// The motion, and for rollouts of which nothing tells a speed, that of a camera that goes on as fast as the frames show.
+pub(super) fn seen_ahead(rows: &RolloutRows, motion: Tensor) -> Result<Tensor, NnError> {
+    let told = rows.told_speeds();
+    let Some(seen) = rows.seen_speeds().filter(|_| !told.iter().all(|told| *told)) else {
+        return Ok(motion);
+    };
+    let untold: Vec<bool> = told.iter().map(|told| !told).collect();
+    let arcs = arcs(&seen.tensor, rows.spec.horizon, rows.spec.frame_period_s)?;
+    Ok((told_only(&motion, &told)? + told_only(&arcs, &untold)?)?)
 }
 
 /// Those rows of `[N, horizon, 3]`; 0 in the others.

@@ -20,6 +20,10 @@ pub struct FlowSpec {
 }
 
 /// Sizes of the flow network's layers.
+#[expect(
+    clippy::struct_excessive_bools,
+    reason = "parts of the network that are there or not"
+)]
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(default, deny_unknown_fields)]

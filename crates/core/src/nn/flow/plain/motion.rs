@@ -3,7 +3,7 @@
 use candle_core::{DType, Device, Tensor};
 
 use crate::nn::error::NnError;
-use crate::nn::flow::motion::{AFFINE, CORRECTION, MotionHead, told_only};
+use crate::nn::flow::motion::{AFFINE, CORRECTION, MotionHead, seen_ahead, told_only};
 use crate::nn::flow::rollout_rows::RolloutRows;
 use crate::nn::ops::sampling::ImageSize;
 use crate::nn::plain::layers::{linear, perceptron};
@@ -14,11 +14,11 @@ impl MotionHead {
     pub(super) fn plain_forward(&self, rows: &RolloutRows, device: &Device) -> Result<Tensor, NnError> {
         let shape = (rows.count(), rows.spec.horizon, 3);
         let Some(layers) = &self.layers else {
-            return self.seen_ahead(rows, Tensor::zeros(shape, DType::F32, device)?);
+            return seen_ahead(rows, Tensor::zeros(shape, DType::F32, device)?);
         };
         let correction = perceptron(layers, &rows.scaled()?.to_device(device)?)?;
         let correction = told_only(&(correction.reshape(shape)? * CORRECTION)?, &rows.tell_anything())?;
-        Ok((self.seen_ahead(rows, self.integral(rows)?.to_device(device)?)? + correction)?)
+        Ok((seen_ahead(rows, self.integral(rows)?.to_device(device)?)? + correction)?)
     }
 
     /// Where each pixel was by a learned affine map of the image; every pixel where it is for a standing camera.
