@@ -50,7 +50,7 @@ pub(super) struct AdaptArgs {
     /// mirrored
     #[arg(long, value_name = "CHANNEL")]
     mirror: Vec<String>,
-    /// Another setting of the training, as in sequence.learning_rate=0.0005; may be repeated
+    /// Another setting of the training, as in data.brightness=0; may be repeated
     #[arg(long = "set", value_name = "KEY=VALUE")]
     settings: Vec<String>,
     /// The directory of the run, for the checkpoint and at the end the model [default: runs/NAME]

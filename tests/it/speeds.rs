@@ -40,9 +40,12 @@ fn turning(name: &str, episodes: usize, plain: bool) -> Dataset {
             ..EpisodeData::default()
         }
     });
-    let channels = || match plain {
-        true => Vec::new(),
-        false => vec![Channel::new("linear", "m/s"), Channel::new("angular", "rad/s")],
+    let channels = || {
+        if plain {
+            Vec::new()
+        } else {
+            vec![Channel::new("linear", "m/s"), Channel::new("angular", "rad/s")]
+        }
     };
     let info = DatasetInfo {
         name: name.to_owned(),
@@ -231,4 +234,36 @@ fn a_model_is_adapted_to_a_recording_and_refused_if_it_became_no_better() {
         "{}",
         text(&refused.stderr)
     );
+}
+
+#[test]
+fn the_shipped_rooms_predicts_frames_of_which_nothing_is_told() {
+    let dir = tempfile::tempdir().unwrap();
+    let project = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let (models, frames) = (project.join("models"), project.join("examples/frames"));
+    let arguments = |model: &'static str| {
+        let of_model = ["predict", "--model", model, "--models-dir", models.to_str().unwrap()];
+        [
+            &of_model[..],
+            &["--frames", frames.to_str().unwrap(), "--at", "9", "--out", model],
+        ]
+        .concat()
+    };
+    let predicted = output(dir.path(), &arguments("rooms"));
+    assert!(predicted.status.success(), "{}", text(&predicted.stderr));
+    assert!(dir.path().join("rooms/predicted-5.png").exists());
+    let refused = output(dir.path(), &arguments("moving-flow"));
+    assert!(
+        text(&refused.stderr).contains("--actions is missing"),
+        "{}",
+        text(&refused.stderr)
+    );
+    // Ways of plans start as commanded where no state tells how fast it drives.
+    let model = registry::load(&models.join("rooms")).unwrap();
+    let ways = model
+        .network
+        .commanded_motion(&[], &[0.3, 0.0].repeat(5), 5)
+        .unwrap()
+        .unwrap();
+    assert!((ways[4][1] - 0.3).abs() < 1e-3, "{ways:?}");
 }

@@ -24,6 +24,7 @@ impl Dataset {
     /// and channels are those of the first. The channels of the others are found by name and unit; those that the first does
     /// not have are left out. One data set stays as it is. Errors: `Usage` if there is none, a
     /// weight is not above 0, a data set occurs twice, or sizes, periods or channels do not fit.
+    #[doc(hidden)]
     pub fn join(mut weighted: Vec<(Self, f64)>, lacking: Lacking) -> Result<Self, DatasetError> {
         check_weights(&weighted)?;
         if weighted.len() == 1 {

@@ -260,12 +260,14 @@ impl TrainConfig {
     }
 
     /// Whether the network sees in the frames how fast the camera drives, so that states and actions may be missing.
+    #[doc(hidden)]
     #[must_use]
     pub fn sees_speeds(&self) -> bool {
         matches!(self.model.architecture, ArchitectureConfig::Flow(layers) if layers.speeds)
     }
 
     /// What becomes of channels and masks that one of several data sets lacks.
+    #[doc(hidden)]
     #[must_use]
     pub fn lacking(&self) -> Lacking {
         if self.sees_speeds() {

@@ -61,10 +61,10 @@ impl StateChannels {
         self.measured[1].map(|channel| state[channel])
     }
 
-    /// Forward speed and yaw rate in a state, each if it is measured and known.
+    /// Forward speed and yaw rate in a state, each if it is measured and known; neither in a state that is not given.
     pub(in crate::nn) fn measured_in(self, state: &[f32]) -> [Option<f32>; 2] {
         self.measured
-            .map(|channel| channel.map(|channel| state[channel]).filter(|speed| speed.is_finite()))
+            .map(|channel| state.get(channel?).copied().filter(|speed| speed.is_finite()))
     }
 
     /// Forward speed and yaw rate in a state, if both are measured and known.
