@@ -70,11 +70,11 @@ impl LivePrediction {
     }
 
     /// Predicts from an image; `None` if it comes between two frames of the model, or before the first action and state that the
-    /// model takes. Errors: `Frame`, `Serving`.
+    /// model needs. Errors: `Frame`, `Serving`.
     pub(super) fn step(&mut self, image: &Frame, time_ns: u64) -> Result<Option<LiveStep>, BridgeError> {
         let model = Arc::clone(&self.model);
         let spec = model.spec();
-        let lacks = |is_taken: bool, is_known: bool| is_taken && !is_known;
+        let lacks = |is_taken: bool, is_known: bool| is_taken && !is_known && !spec.sees_speeds();
         if lacks(spec.action_inputs().is_some(), self.action.is_some())
             || lacks(spec.state_inputs().is_some(), self.state.is_some())
         {

@@ -18,8 +18,8 @@ use foreframe_train::evaluation::{self, CameraEstimate};
 use foreframe_train::settings::SettingsLayer;
 use foreframe_train::training::TrainConfig;
 
-/// Validation windows that are compared, at most.
-const COMPARED_WINDOWS: usize = 200;
+/// Validation windows that choose the weights, at most, and about as many others that judge them.
+const COMPARED_WINDOWS: usize = 100;
 /// Where a camera is taken to be whose height is not known, in metres: distances then count in units of it.
 const HEIGHT_M: f32 = 0.6;
 
@@ -40,7 +40,7 @@ pub(super) struct AdaptArgs {
     /// The model to start from, which must see how fast the camera drives: its directory, name or NAME@VERSION
     #[arg(long, value_name = "MODEL", default_value = "rooms")]
     from: String,
-    /// The name of the new model: 1 to 64 of a–z, 0–9 and '-' [default: that of the data set]
+    /// The name of the new model: 1 to 64 of a–z, 0–9 and '-' [default: DATASET-adapted]
     #[arg(long)]
     name: Option<String>,
     /// Updates, of 16 windows each; the weights with the least validation error are kept
@@ -99,7 +99,7 @@ pub(super) fn run(args: &AdaptArgs) -> Result<(), CliError> {
         config.name
     ))?;
     if after >= before {
-        fs::remove_dir_all(&model_dir).map_err(|error| CliError::io("delete", &model_dir, &error))?;
+        fs::remove_dir_all(&run_dir).map_err(|error| CliError::io("delete", &run_dir, &error))?;
         return Err(CliError::Usage(format!(
             "{} became no better than {}, so it was deleted; record more, or try other --steps",
             config.name, args.from
@@ -148,19 +148,25 @@ fn config(args: &AdaptArgs, base: &Model, dataset: &Dataset) -> Result<TrainConf
         (true, true) => Conditioning::None,
     };
     let finds_movers = base.spec().flow().is_some_and(|flow| flow.layers.movers) && info.has_masks;
-    let mut settings = vec![
-        format!("name={}", args.name.as_deref().unwrap_or(&info.name)),
+    let settings = [
+        match &args.name {
+            Some(name) => format!("name={name}"),
+            None => format!("name={}-adapted", info.name),
+        },
         format!("model.conditioning={conditioning}"),
         format!("model.flow.movers={finds_movers}"),
         format!("sequence.steps={}", args.steps),
         "sequence.learning_rate=0.001".to_owned(),
         "run.validate_every_steps=50".to_owned(),
         "data.brightness=0.1".to_owned(),
-        "data.validation_windows=200".to_owned(),
+        format!("data.validation_windows={COMPARED_WINDOWS}"),
+        "sequence.batch_size=16".to_owned(),
+        "run.batch_parts=2".to_owned(),
+        match args.mirror.as_slice() {
+            [] => "data.mirror=off".to_owned(),
+            channels => format!("data.mirror={channels:?}"),
+        },
     ];
-    if !args.mirror.is_empty() {
-        settings.push(format!("data.mirror={:?}", args.mirror));
-    }
     let all = settings.iter().chain(&args.settings);
     let layers = all.map(|setting| SettingsLayer::assignment(setting));
     Ok(TrainConfig::of_model(
@@ -169,7 +175,7 @@ fn config(args: &AdaptArgs, base: &Model, dataset: &Dataset) -> Result<TrainConf
     )?)
 }
 
-/// Windows of the validation split, evenly spread. Errors: `Usage` if there is none.
+/// Windows of the validation split, evenly spread, between those that choose the weights. Errors: `Usage` if there is none.
 fn compared_windows(base: &Model, dataset: &Dataset) -> Result<Vec<Window>, CliError> {
     let all = evaluation::windows_of(base, dataset, Split::Validation)?;
     if all.is_empty() {
@@ -179,7 +185,7 @@ fn compared_windows(base: &Model, dataset: &Dataset) -> Result<Vec<Window>, CliE
         )));
     }
     let stride = all.len().div_ceil(COMPARED_WINDOWS);
-    Ok(all.into_iter().step_by(stride).collect())
+    Ok(all.into_iter().skip(stride / 2).step_by(stride).collect())
 }
 
 fn mean_error(model: &Model, dataset: &Dataset, windows: &[Window]) -> Result<f64, CliError> {

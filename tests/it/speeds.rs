@@ -4,10 +4,11 @@ use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
 use candle_core::{Device, Tensor};
+use foreframe_core::frame::codec;
 use foreframe_core::nn::ConditioningTensors;
 use foreframe_core::registry::{self, StoredWeights};
 use foreframe_core::types::Channel;
-use foreframe_data::dataset::{Dataset, DatasetInfo, EpisodeData, Lacking};
+use foreframe_data::dataset::{Dataset, DatasetInfo, EpisodeData, Lacking, Window};
 use foreframe_train::evaluation::window_errors;
 use foreframe_train::training::{TrainConfig, TrainError, Training, TrainingOutcome, run};
 
@@ -130,8 +131,28 @@ fn a_network_sees_how_fast_the_camera_turns() {
         let errors = window_errors(&model, dataset, &windows, spec.horizon).unwrap();
         errors.iter().sum::<f64>() / errors.len() as f64
     };
-    let (told, untold) = (mean(&dataset), mean(&turning("plain", 40, true)));
-    assert!(untold < 2.0 * told + 5e-4, "{untold}, {told} with states and actions");
+    let (known, unknown) = (mean(&dataset), mean(&turning("plain", 40, true)));
+    assert!(
+        unknown < 2.0 * known + 5e-4,
+        "{unknown}, {known} with states and actions"
+    );
+    let copied = |window: &Window| -> f64 {
+        let last = dataset
+            .pixels(window.first_frame + spec.context - 1)
+            .unwrap()
+            .into_owned();
+        let next = dataset.pixels(window.first_frame + spec.context).unwrap().into_owned();
+        let squares = last
+            .iter()
+            .zip(&next)
+            .map(|(a, b)| ((f64::from(*a) - f64::from(*b)) / 255.0).powi(2));
+        squares.sum::<f64>() / last.len() as f64
+    };
+    let copied = windows.iter().map(copied).sum::<f64>() / windows.len() as f64;
+    assert!(
+        unknown < 0.5 * copied,
+        "{unknown}, {copied} of the last frame, one step ahead"
+    );
 }
 
 #[test]
@@ -163,12 +184,27 @@ fn data_sets_without_states_join_others_where_the_network_needs_none() {
             .all(|channel| channel.mean.is_finite())
     );
 
-    // A recording with other channels: what both have stays.
-    let settings = ["sequence.steps=2", "model.conditioning=none", "data.hidden=0"];
+    // A recording without channels: what reads them is left out, and the rows of the others stay.
+    let settings = [
+        "sequence.steps=1",
+        "model.conditioning=none",
+        "data.hidden=0",
+        "run.warmup_steps=100",
+    ];
     train(&config(&settings), &second, &dir.path().join("none"), Some(&start)).unwrap();
     let tuned = registry::load_weights(&dir.path().join("none/model")).unwrap();
-    let count = |weights: &StoredWeights| weights.parameters.get("flow.motion.inputs.weight").is_some();
-    assert!(count(&start) && !count(&tuned));
+    assert!(tuned.parameters.get("flow.motion.inputs.weight").is_none());
+    let rows = |weights: &StoredWeights| {
+        let tensor = weights.parameters.get("flow.modulation.inputs.weight").unwrap();
+        tensor.as_tensor().to_vec2::<f32>().unwrap()
+    };
+    let (before, after) = (rows(&start), rows(&tuned));
+    // Two states and two actions of two steps went.
+    assert_eq!(before.len(), after.len() + 2 + 2 * 2);
+    for (before, after) in before[6..].iter().zip(&after) {
+        let difference = before.iter().zip(after).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+        assert!(difference < 0.01, "{difference}");
+    }
 }
 
 #[test]
@@ -183,51 +219,78 @@ fn nothing_is_hidden_from_a_network_that_cannot_see_speeds() {
     );
 }
 
-#[test]
-fn a_model_is_adapted_to_a_recording_and_refused_if_it_became_no_better() {
-    let dir = tempfile::tempdir().unwrap();
-    let rooms = Path::new(env!("CARGO_MANIFEST_DIR")).join("models");
-    let rooms = rooms.to_str().unwrap();
-    let collected = output(
-        dir.path(),
-        &[
-            "collect",
-            "--scenario",
-            "moving-observer",
-            "--rooms",
-            "varied",
-            "--trials",
-            "12",
-            "--name",
-            "drives",
-        ],
-    );
+/// A recording of a car in a folder: frames of simulated drives, with a steering angle and a throttle of its own kind.
+fn record_car(dir: &Path) {
+    let arguments = "collect --scenario moving-observer --rooms varied --trials 12 --name drives";
+    let collected = output(dir, &arguments.split(' ').collect::<Vec<_>>());
     assert!(collected.status.success(), "{}", text(&collected.stderr));
-    let adapt = |more: &[&str]| {
-        let settings = ["adapt", "drives", "--models-dir", rooms, "--steps"];
-        output(dir.path(), &[&settings[..], more].concat())
+    let drives = Dataset::open(&dir.join("data/datasets/drives")).unwrap();
+    std::fs::create_dir(dir.join("recorded")).unwrap();
+    let mut table = "timestamp,file,action.angle,action.throttle\n".to_owned();
+    for frame in 0..drives.info().frame_count {
+        let png = codec::encode_png(&drives.frame(frame).unwrap()).unwrap();
+        std::fs::write(dir.join(format!("recorded/{frame:04}.png")), png).unwrap();
+        let [linear, angular] = [drives.action(frame)[0], drives.action(frame)[1]];
+        table += &format!(
+            "{:.1},{frame:04}.png,{},{}\n",
+            frame as f64 * 0.2,
+            -0.7 * angular,
+            2.0 * linear
+        );
+    }
+    std::fs::write(dir.join("recorded/car.csv"), table).unwrap();
+    let imported = output(
+        dir,
+        &["import", "recorded", "--csv", "recorded/car.csv", "--name", "car"],
+    );
+    assert!(imported.status.success(), "{}", text(&imported.stderr));
+}
+
+#[test]
+fn rooms_is_scored_on_a_car_and_adapted_to_it_unless_it_gets_worse() {
+    let dir = tempfile::tempdir().unwrap();
+    record_car(dir.path());
+    let models = Path::new(env!("CARGO_MANIFEST_DIR")).join("models");
+    let run = |arguments: &str| {
+        let own = ["--models-dir", models.to_str().unwrap()];
+        output(dir.path(), &arguments.split(' ').chain(own).collect::<Vec<_>>())
     };
-    let adapted = adapt(&[
-        "2",
-        "--name",
-        "mine",
-        "--mirror",
-        "angular",
-        "--set",
-        "sequence.batch_size=2",
-    ]);
+    let scored = run("evaluate --model rooms --dataset car --split validation --windows 12 --nearest-windows 40");
+    assert!(scored.status.success(), "{}", text(&scored.stderr));
+    let said = text(&scored.stdout);
+    assert!(
+        said.contains("against baselines that know nothing of this data set"),
+        "{said}"
+    );
+    let refused = run("calibrate --model rooms --dataset car");
+    assert_eq!(refused.status.code(), Some(2));
+    assert!(text(&refused.stderr).contains("angle"), "{}", text(&refused.stderr));
+
+    let short = "--set sequence.batch_size=2 --set run.warmup_steps=0 --steps 4";
+    let adapted = run(&format!(
+        "adapt car --mirror angle {short} --set sequence.learning_rate=0.0003"
+    ));
     let said = format!("{}{}", text(&adapted.stdout), text(&adapted.stderr));
+    for part in [
+        "camera, estimated from",
+        "the last frame, copied",
+        "rooms as it is",
+        "car-adapted",
+    ] {
+        assert!(said.contains(part), "{said}");
+    }
+    // With so large a step, it gets worse.
+    let worse = run(&format!(
+        "adapt car --name worse {short} --set sequence.learning_rate=0.1"
+    ));
+    assert_eq!(worse.status.code(), Some(2), "{}", text(&worse.stdout));
     assert!(
-        said.contains("the last frame, copied") && said.contains("rooms as it is"),
-        "{said}"
+        text(&worse.stderr).contains("became no better than rooms"),
+        "{}",
+        text(&worse.stderr)
     );
-    let is_better = adapted.status.success();
-    assert_eq!(dir.path().join("runs/mine/model").exists(), is_better, "{said}");
-    assert!(
-        is_better || said.contains("became no better than rooms, so it was deleted"),
-        "{said}"
-    );
-    let refused = adapt(&["2", "--from", "moving-flow"]);
+    assert!(!dir.path().join("runs/worse").exists());
+    let refused = run("adapt car --from moving-flow");
     assert_eq!(refused.status.code(), Some(2));
     assert!(
         text(&refused.stderr).contains("start from rooms"),

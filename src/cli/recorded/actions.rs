@@ -53,7 +53,8 @@ impl ActionsFile {
 
     /// Whether the file holds the state at frame `last`, if the model takes it. Errors: `Usage`.
     pub(in crate::cli) fn check_states(&self, path: &Path, last: usize, spec: &ModelSpec) -> Result<(), CliError> {
-        if spec.state_inputs().is_none() || self.states.len() > last {
+        let needs_none = spec.sees_speeds() && self.states.is_empty();
+        if spec.state_inputs().is_none() || needs_none || self.states.len() > last {
             return Ok(());
         }
         Err(CliError::Usage(format!(

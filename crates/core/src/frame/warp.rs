@@ -51,8 +51,7 @@ impl TryFrom<UncheckedCameraModel> for CameraModel {
 
 impl CameraModel {
     /// What counts where nothing is known of a camera.
-    #[doc(hidden)]
-    pub const USUAL: Self = Self {
+    pub(crate) const USUAL: Self = Self {
         horizontal_fov_rad: 1.05,
         tilt_down_rad: 0.2,
         height_m: Some(Self::USUAL_HEIGHT_M),

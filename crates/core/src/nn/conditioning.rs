@@ -61,8 +61,8 @@ impl ConditioningTensors {
     /// `Missing`, `Shape`.
     pub(super) fn values(&self, spec: &ModelSpec, batch: usize) -> Result<ConditioningValues, NnError> {
         let told = Self {
-            actions: self.actions.clone().or_else(|| spec.untold_actions(batch)),
-            state: self.state.clone().or_else(|| spec.untold_state(batch)),
+            actions: self.actions.clone().or_else(|| spec.unknown_actions(batch)),
+            state: self.state.clone().or_else(|| spec.unknown_state(batch)),
             ..Self::none()
         };
         let [actions, states] = told.used(spec, batch)?;
@@ -104,13 +104,13 @@ impl ConditioningTensors {
 
 impl ModelSpec {
     /// Actions of which nothing is known, where the model can do without.
-    fn untold_actions(&self, batch: usize) -> Option<Tensor> {
+    fn unknown_actions(&self, batch: usize) -> Option<Tensor> {
         let count = self.action_inputs().filter(|_| self.sees_speeds())?;
         Tensor::full(f32::NAN, (batch, self.horizon, count), &Device::Cpu).ok()
     }
 
     /// States of which nothing is known, where the model can do without.
-    fn untold_state(&self, batch: usize) -> Option<Tensor> {
+    fn unknown_state(&self, batch: usize) -> Option<Tensor> {
         let count = self.state_inputs().filter(|_| self.sees_speeds())?;
         Tensor::full(f32::NAN, (batch, count), &Device::Cpu).ok()
     }

@@ -33,9 +33,9 @@ pub struct Calibration {
     pub windows: usize,
     /// The error of each predicted step.
     pub steps: Vec<StepErrors>,
-    /// The same where neither state nor actions are known, for models that can do without; else empty.
+    /// The same where no action is known, fitted without states too, for models that can do without; else empty.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    pub untold_steps: Vec<StepErrors>,
+    pub steps_without_actions: Vec<StepErrors>,
     /// How unlike the training data a context is.
     pub novelty: NoveltyScale,
     /// Smallest and largest value of each action channel in training; empty if the model takes no actions.
@@ -57,9 +57,11 @@ impl Calibration {
             ("actions", self.actions.len(), spec.action_inputs().unwrap_or(0)),
             ("states", self.states.len(), spec.state_inputs().unwrap_or(0)),
         ];
-        let untold = [("untold_steps", self.untold_steps.len(), spec.horizon)];
-        let untold = untold.into_iter().filter(|_| !self.untold_steps.is_empty());
-        for (what, found, wanted) in lengths.into_iter().chain(untold) {
+        let without_actions = [("steps_without_actions", self.steps_without_actions.len(), spec.horizon)];
+        let without_actions = without_actions
+            .into_iter()
+            .filter(|_| !self.steps_without_actions.is_empty());
+        for (what, found, wanted) in lengths.into_iter().chain(without_actions) {
             if found != wanted {
                 return Err(format!("calibration.{what} has {found} entries; it must have {wanted}"));
             }
@@ -72,7 +74,7 @@ impl Calibration {
         let is_valid_at_pose = novelty.at_pose.as_ref().is_none_or(LookAtPose::is_valid);
         let rules = [
             (
-                self.steps.iter().chain(&self.untold_steps).all(factors),
+                self.steps.iter().chain(&self.steps_without_actions).all(factors),
                 "steps: each step needs eight weights, a mean_factor above 0, and a low_factor of at most the high_factor",
             ),
             (square, "novelty.whitening: it must have a row for each statistic"),
@@ -287,8 +289,8 @@ impl RolloutInContext<'_> {
     #[must_use]
     pub fn expected_errors(&self, calibration: &Calibration) -> Vec<ExpectedError> {
         let inputs = self.error_inputs(&calibration.novelty);
-        let steps = if self.is_untold() && !calibration.untold_steps.is_empty() {
-            &calibration.untold_steps
+        let steps = if self.lacks_actions() && !calibration.steps_without_actions.is_empty() {
+            &calibration.steps_without_actions
         } else {
             &calibration.steps
         };
@@ -297,7 +299,7 @@ impl RolloutInContext<'_> {
     }
 
     /// Whether the model takes actions, and none is known.
-    fn is_untold(&self) -> bool {
+    fn lacks_actions(&self) -> bool {
         self.spec.action_inputs().is_some() && !self.actions.iter().any(|value| value.is_finite())
     }
 

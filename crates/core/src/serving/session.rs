@@ -131,7 +131,7 @@ impl SessionState {
         }
         let raw = RawConditioning {
             past: &[],
-            plan: Some(&snapshot.actions),
+            plan: (!snapshot.actions.is_empty() || !spec.sees_speeds()).then_some(&*snapshot.actions),
             state: snapshot.state.as_ref(),
             steps: snapshot.steps,
         };
@@ -232,8 +232,10 @@ impl SessionState {
         while self.features.len() > spec.context {
             self.features.pop_front();
         }
-        if let Some(state) = self.conditioning.state.take().filter(|_| spec.reads_past_states()) {
-            self.past_states.push_back(state);
+        match self.conditioning.state.take().filter(|_| spec.reads_past_states()) {
+            Some(state) => self.past_states.push_back(state),
+            // The states before a gap would count as those of other frames.
+            None => self.past_states.clear(),
         }
         while self.past_states.len() >= spec.context {
             self.past_states.pop_front();

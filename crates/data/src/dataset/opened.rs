@@ -186,15 +186,14 @@ impl Dataset {
         self.images.changed(Cow::Borrowed(pixels))
     }
 
-    /// The camera of each of the episodes, given by position; empty if none is known. Where only some are, the others are taken to
-    /// be the usual one.
-    pub fn cameras(&self, episodes: impl IntoIterator<Item = usize>) -> Vec<CameraModel> {
-        let cameras: Vec<_> = episodes.into_iter().map(|episode| self.camera(episode)).collect();
-        if cameras.iter().all(Option::is_none) {
-            return Vec::new();
-        }
-        let known = cameras.into_iter().map(|camera| camera.unwrap_or(CameraModel::USUAL));
-        known.collect()
+    /// The camera of each of the episodes, given by position, or this other one where it is not known; empty unless all are known then.
+    pub fn cameras(
+        &self,
+        episodes: impl IntoIterator<Item = usize>,
+        otherwise: Option<CameraModel>,
+    ) -> Vec<CameraModel> {
+        let cameras = episodes.into_iter().map(|episode| self.camera(episode).or(otherwise));
+        cameras.collect::<Option<_>>().unwrap_or_default()
     }
 
     /// The intensities of a frame, row by row: borrowed from memory, or read from the file of decoded frames. Panics if there

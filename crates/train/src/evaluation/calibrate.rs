@@ -7,7 +7,7 @@ use std::sync::atomic::AtomicBool;
 
 use super::config::EvaluateConfig;
 use super::division::Division;
-use super::forecast::{Forecast, contexts, forecasts, untold_forecasts};
+use super::forecast::{Forecast, contexts, forecasts, forecasts_without_inputs};
 use super::inference::Inference;
 use super::least_squares::{factor, second_moments, solve};
 use super::novelty_scale::novelty_scale;
@@ -43,7 +43,7 @@ pub fn calibrate(
     on_progress: &(dyn Fn(EvaluationProgress) + Sync),
 ) -> Result<Calibration, EvaluationError> {
     config.validate()?;
-    compatible::check(loaded, dataset)?;
+    compatible::check_inputs(loaded, dataset)?;
     let split_seed = compatible::split_seed(loaded, dataset, config.split_seed)?;
     let splits = Splits::new(dataset, split_seed);
     let shape = window_shape(loaded.spec());
@@ -73,12 +73,18 @@ pub fn calibrate(
         Some(channels) => ranges(&training, shape.frames(), channels, values),
         None => Vec::new(),
     };
-    let validation = evenly(&validation, config.max_windows);
+    // Of joined data sets, some may have no actions; `steps` is for windows that have.
+    let knows_actions = |window: &Window| {
+        let action = dataset.action(window.first_frame + spec.context - 1);
+        spec.action_inputs().is_none() || action.iter().all(|value| value.is_finite())
+    };
+    let known: Vec<Window> = validation.iter().copied().filter(knows_actions).collect();
+    let validation = evenly(if known.is_empty() { &validation } else { &known }, config.max_windows);
     let mut calibration = Calibration {
         dataset_content_hash: dataset.info().content_hash.clone(),
         windows: validation.len(),
         steps: Vec::new(),
-        untold_steps: Vec::new(),
+        steps_without_actions: Vec::new(),
         novelty: novelty_scale(&seen, &poses.collect::<Vec<_>>()),
         actions: range(spec.action_inputs(), &|frame| dataset.action(frame).to_vec()),
         states: range(spec.state_inputs(), &|frame| dataset.state(frame).to_vec()),
@@ -91,7 +97,7 @@ pub fn calibrate(
     let steps = |found: &[Forecast]| (0..spec.horizon).map(|step| step_errors(found, step)).collect();
     calibration.steps = steps(&found);
     if spec.sees_speeds() && spec.action_inputs().is_some() {
-        calibration.untold_steps = steps(&untold_forecasts(
+        calibration.steps_without_actions = steps(&forecasts_without_inputs(
             &evaluation(Split::Validation),
             &validation,
             &calibration,

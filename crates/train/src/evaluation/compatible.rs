@@ -58,6 +58,31 @@ pub(super) fn has_states_of(spec: &ModelSpec, dataset: &Dataset) -> bool {
     spec.state_inputs().is_some() && comma_separated(&spec.states) == comma_separated(&dataset.info().state_channels)
 }
 
+/// Errors: `Mismatch` where the model cannot run on the data set, or could only without the states and actions that it takes.
+pub(super) fn check_inputs(loaded: &Model, dataset: &Dataset) -> Result<(), EvaluationError> {
+    check(loaded, dataset)?;
+    let (spec, info) = (loaded.spec(), dataset.info());
+    let lacks_actions = spec.action_inputs().is_some() && !has_actions_of(spec, dataset);
+    let lacks_states = spec.state_inputs().is_some() && !has_states_of(spec, dataset);
+    if !(lacks_actions || lacks_states) {
+        return Ok(());
+    }
+    let channels = [
+        comma_separated(&info.action_channels),
+        comma_separated(&info.state_channels),
+    ];
+    Err(EvaluationError::Mismatch {
+        dataset: info.name.clone(),
+        found: format!("the actions [{}] and the states [{}]", channels[0], channels[1]),
+        model: loaded.manifest.name.clone(),
+        wanted: format!(
+            "takes [{}] and [{}]",
+            comma_separated(&spec.actions),
+            comma_separated(&spec.states)
+        ),
+    })
+}
+
 /// Whether the data set's actions are those that the model takes.
 pub(super) fn has_actions_of(spec: &ModelSpec, dataset: &Dataset) -> bool {
     spec.action_inputs().is_some() && comma_separated(&spec.actions) == comma_separated(&dataset.info().action_channels)

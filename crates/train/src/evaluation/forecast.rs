@@ -39,13 +39,13 @@ pub(super) fn forecasts(
 }
 
 /// The same without states and actions, for a model that can do without. Errors: as [`forecasts`].
-pub(super) fn untold_forecasts(
+pub(super) fn forecasts_without_inputs(
     evaluation: &EvaluationContext,
     windows: &[Window],
     calibration: &Calibration,
 ) -> Result<Vec<Forecast>, EvaluationError> {
     evaluation.in_batches(EvaluationStage::Calibration, windows, |batch| {
-        forecast_batch(evaluation, batch, calibration, ActionSource::Untold)
+        forecast_batch(evaluation, batch, calibration, ActionSource::NoInputs)
     })
 }
 

@@ -28,7 +28,7 @@ pub(super) enum ActionSource<'a> {
     /// Zero in every component, in the channels' own units.
     Zero,
     /// None, and no states either: only for models that can do without.
-    Untold,
+    NoInputs,
 }
 
 /// What a model predicted from a batch of windows, one window after another.
@@ -180,8 +180,11 @@ impl<'a> Inference<'a> {
         let (dataset, spec, batch) = (self.dataset, self.spec(), windows.len());
         let last = spec.context - 1;
         let mut condition = ConditioningTensors::none();
-        condition.cameras = dataset.cameras(windows.iter().map(|window| window.episode));
-        if matches!(source, ActionSource::Untold) {
+        condition.cameras = dataset.cameras(
+            windows.iter().map(|window| window.episode),
+            spec.flow().and_then(|flow| flow.camera),
+        );
+        if matches!(source, ActionSource::NoInputs) {
             return Ok(condition);
         }
         if let Some(count) = spec.action_inputs().filter(|_| has_actions_of(spec, dataset)) {

@@ -4,6 +4,7 @@ use super::EvaluationError;
 use super::actions::{self, VariantErrors};
 use super::baselines::Baselines;
 use super::bootstrap::is_recording;
+use super::compatible::has_actions_of;
 use super::forecast::{Forecast, forecasts};
 use super::metrics::{WindowScores, add_benchmark};
 use super::pixel_class::{self, ClassSums};
@@ -55,7 +56,9 @@ impl Measurements {
         let calibration = loaded.manifest.calibration.as_ref();
         Ok(Self {
             scores: score(evaluation, windows, baselines)?,
-            actions: loaded.spec().action_inputs().map(|_| actions()).transpose()?,
+            actions: has_actions_of(loaded.spec(), evaluation.inference.dataset)
+                .then(actions)
+                .transpose()?,
             surroundings: surroundings::measure(evaluation, windows)?,
             visibility: visibility::measure(evaluation, windows, baselines)?,
             forecasts: calibration

@@ -7,6 +7,7 @@ use super::TrainError;
 use super::augment::{ACTION, Augmentation, Hidden, STATE, WindowChange};
 use super::config::Target;
 use foreframe_core::frame::preprocess::Preprocess;
+use foreframe_core::frame::warp::CameraModel;
 use foreframe_core::nn::ConditioningTensors;
 use foreframe_data::dataset::sampler::WindowShape;
 use foreframe_data::dataset::{Dataset, Window};
@@ -18,6 +19,8 @@ pub(super) struct FrameSource<'a> {
     target: Preprocess,
     augmentation: Augmentation,
     reads_masks: bool,
+    /// What counts where the data set does not know its camera.
+    camera: Option<CameraModel>,
 }
 
 /// A window of a batch, and how it is changed.
@@ -84,12 +87,18 @@ impl<'a> FrameSource<'a> {
             target,
             augmentation,
             reads_masks: false,
+            camera: None,
         }
     }
 
     /// The same source, whose batches also say where movers are, if the data set has masks.
     pub(super) fn with_masks(self, reads_masks: bool) -> Self {
         Self { reads_masks, ..self }
+    }
+
+    /// The same source, with the camera of windows whose data set does not know it.
+    pub(super) fn with_camera(self, camera: Option<CameraModel>) -> Self {
+        Self { camera, ..self }
     }
 
     /// The data set.
@@ -196,7 +205,9 @@ impl<'a> FrameSource<'a> {
                     |hidden| hidden != Hidden::Nothing,
                     self.channels(STATE, &earlier, &[windows.len(), context - 1])?,
                 )?,
-                cameras: self.dataset.cameras(windows.iter().map(|drawn| drawn.window.episode)),
+                cameras: self
+                    .dataset
+                    .cameras(windows.iter().map(|drawn| drawn.window.episode), self.camera),
             },
             future_states: self.channels(STATE, &future, &[windows.len(), horizon])?,
             measured,

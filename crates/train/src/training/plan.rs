@@ -76,7 +76,8 @@ impl<'a> TrainingPlan<'a> {
         let augmentation = Augmentation::new(&config.data, dataset, &frames, config.seed)?;
         Ok(Self {
             source: FrameSource::new(dataset, spec.preprocess, config.sequence.target, augmentation)
-                .with_masks(finds_movers(&spec)),
+                .with_masks(finds_movers(&spec))
+                .with_camera(spec.flow().and_then(|flow| flow.camera)),
             spec,
             train,
             mixture,

@@ -134,7 +134,8 @@ pub(super) fn inputs(spec: &ModelSpec) -> Vec<Field> {
     let frames = Field::new("frames", Datatype::Uint8, vec![spec.context as i64, height, width]);
     let mut fields = vec![frames];
     if let Some(states) = spec.state_inputs() {
-        fields.push(Field::new("state", Datatype::Fp32, vec![states as i64]));
+        let state = Field::new("state", Datatype::Fp32, vec![states as i64]);
+        fields.push(if spec.sees_speeds() { state.optional() } else { state });
     }
     if let Some(actions) = spec.action_inputs() {
         let actions = actions as i64;

@@ -69,11 +69,27 @@ impl MotionHead {
         let spec = rows.spec;
         let shape = (rows.count(), spec.horizon, 3);
         let Some(layers) = &self.layers else {
-            return seen_ahead(rows, Tensor::zeros(shape, DType::F32, &Device::Cpu)?);
+            return seen_ahead(rows, self.unchanged_ahead(rows)?);
         };
         let correction = (perceptron(layers, &rows.scaled()?)?.reshape(shape)? * CORRECTION)?;
-        let correction = told_only(&correction, &rows.tell_anything())?;
+        let correction = of_rows(&correction, &rows.rows_with_known_inputs())?;
         Ok((seen_ahead(rows, self.integral(rows)?)? + correction)?)
+    }
+
+    /// The motion `[N, horizon, 3]` of a camera of which no action tells, on the CPU: as fast as it is known to drive if the network sees
+    /// speeds; else it stands.
+    pub(super) fn unchanged_ahead(&self, rows: &RolloutRows) -> Result<Tensor, NnError> {
+        let spec = rows.spec;
+        if !self.sees_speeds {
+            return Ok(Tensor::zeros(
+                (rows.count(), spec.horizon, 3),
+                DType::F32,
+                &Device::Cpu,
+            )?);
+        }
+        let speeds = (0..rows.count()).flat_map(|row| rows.first_speeds(row).map(Option::unwrap_or_default));
+        let speeds = Tensor::from_vec(speeds.collect::<Vec<_>>(), (rows.count(), 2), &Device::Cpu)?;
+        arcs(&speeds, spec.horizon, spec.frame_period_s)
     }
 
     /// The motion of a base that follows its commands `[N, horizon, 3]`, on the CPU.
@@ -115,17 +131,17 @@ impl MotionHead {
 
 /// The motion, and for rollouts of which nothing tells a speed, that of a camera that goes on as fast as the frames show.
 pub(super) fn seen_ahead(rows: &RolloutRows, motion: Tensor) -> Result<Tensor, NnError> {
-    let told = rows.told_speeds();
-    let Some(seen) = rows.seen_speeds().filter(|_| !told.iter().all(|told| *told)) else {
+    let known = rows.rows_with_known_speeds();
+    let Some(seen) = rows.seen_speeds().filter(|_| !known.iter().all(|known| *known)) else {
         return Ok(motion);
     };
-    let untold: Vec<bool> = told.iter().map(|told| !told).collect();
+    let unknown: Vec<bool> = known.iter().map(|known| !known).collect();
     let arcs = arcs(&seen.tensor, rows.spec.horizon, rows.spec.frame_period_s)?;
-    Ok((told_only(&motion, &told)? + told_only(&arcs, &untold)?)?)
+    Ok((of_rows(&motion, &known)? + of_rows(&arcs, &unknown)?)?)
 }
 
 /// Those rows of `[N, horizon, 3]`; 0 in the others.
-pub(super) fn told_only(values: &Tensor, rows: &[bool]) -> Result<Tensor, NnError> {
+pub(super) fn of_rows(values: &Tensor, rows: &[bool]) -> Result<Tensor, NnError> {
     if rows.iter().all(|row| *row) {
         return Ok(values.clone());
     }

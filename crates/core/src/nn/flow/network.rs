@@ -148,7 +148,7 @@ impl FlowNetwork {
         let Some(head) = self
             .speeds
             .as_ref()
-            .filter(|_| self.is_trained() || !rows.tell_speeds())
+            .filter(|_| self.is_trained() || !rows.all_know_speeds())
         else {
             return Ok(rows.part(0..rows.count()));
         };

@@ -105,7 +105,7 @@ impl<'a> RolloutRows<'a> {
     }
 
     /// Whether the state of each rollout tells both speeds.
-    pub(super) fn tell_speeds(&self) -> bool {
+    pub(super) fn all_know_speeds(&self) -> bool {
         let channels = StateChannels::of(self.spec);
         (0..self.count()).all(|row| channels.measured_speeds_in(self.state(row)).is_some())
     }
@@ -118,7 +118,7 @@ impl<'a> RolloutRows<'a> {
     }
 
     /// Whether each rollout's states or actions tell a speed.
-    pub(super) fn told_speeds(&self) -> Vec<bool> {
+    pub(super) fn rows_with_known_speeds(&self) -> Vec<bool> {
         let channels = StateChannels::of(self.spec);
         let told = |row: usize| {
             let measured = channels.measured_in(self.state(row));
@@ -207,7 +207,7 @@ impl<'a> RolloutRows<'a> {
     }
 
     /// Whether anything that the layers read of each rollout's state and actions is known.
-    pub(super) fn tell_anything(&self) -> Vec<bool> {
+    pub(super) fn rows_with_known_inputs(&self) -> Vec<bool> {
         let told = |row: usize| {
             let state = self.state(row);
             let read = self.read.iter().map(|&channel| state[channel]);

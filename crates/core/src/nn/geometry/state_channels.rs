@@ -90,7 +90,9 @@ impl StateChannels {
             (state[sin], state[cos]) = pose.heading.sin_cos();
         }
         for (measured, commanded) in self.measured.into_iter().zip(self.commanded) {
-            if let (Some(measured), Some(commanded)) = (measured, commanded) {
+            if let (Some(measured), Some(commanded)) = (measured, commanded)
+                && action[commanded].is_finite()
+            {
                 state[measured] = action[commanded];
             }
         }

@@ -1,9 +1,9 @@
 //! How the camera moves, as [`super::super::motion`] says.
 
-use candle_core::{DType, Device, Tensor};
+use candle_core::{Device, Tensor};
 
 use crate::nn::error::NnError;
-use crate::nn::flow::motion::{AFFINE, CORRECTION, MotionHead, seen_ahead, told_only};
+use crate::nn::flow::motion::{AFFINE, CORRECTION, MotionHead, of_rows, seen_ahead};
 use crate::nn::flow::rollout_rows::RolloutRows;
 use crate::nn::ops::sampling::ImageSize;
 use crate::nn::plain::layers::{linear, perceptron};
@@ -14,10 +14,13 @@ impl MotionHead {
     pub(super) fn plain_forward(&self, rows: &RolloutRows, device: &Device) -> Result<Tensor, NnError> {
         let shape = (rows.count(), rows.spec.horizon, 3);
         let Some(layers) = &self.layers else {
-            return seen_ahead(rows, Tensor::zeros(shape, DType::F32, device)?);
+            return seen_ahead(rows, self.unchanged_ahead(rows)?.to_device(device)?);
         };
         let correction = perceptron(layers, &rows.scaled()?.to_device(device)?)?;
-        let correction = told_only(&(correction.reshape(shape)? * CORRECTION)?, &rows.tell_anything())?;
+        let correction = of_rows(
+            &(correction.reshape(shape)? * CORRECTION)?,
+            &rows.rows_with_known_inputs(),
+        )?;
         Ok((seen_ahead(rows, self.integral(rows)?.to_device(device)?)? + correction)?)
     }
 
