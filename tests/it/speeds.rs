@@ -1,13 +1,15 @@
 //! Networks that see how fast the camera drives: trained on the simulator, they do without states and actions.
 
 use std::path::Path;
+use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 use candle_core::{Device, Tensor};
-use foreframe_core::frame::codec;
+use foreframe_core::frame::{Frame, codec};
 use foreframe_core::nn::ConditioningTensors;
 use foreframe_core::registry::{self, StoredWeights};
-use foreframe_core::types::Channel;
+use foreframe_core::serving::Session;
+use foreframe_core::types::{Channel, RobotState};
 use foreframe_data::dataset::{Dataset, DatasetInfo, EpisodeData, Lacking, Window};
 use foreframe_train::evaluation::window_errors;
 use foreframe_train::training::{TrainConfig, TrainError, Training, TrainingOutcome, run};
@@ -329,4 +331,32 @@ fn the_shipped_rooms_predicts_frames_of_which_nothing_is_told() {
         .unwrap()
         .unwrap();
     assert!((ways[4][1] - 0.3).abs() < 1e-3, "{ways:?}");
+}
+
+#[test]
+fn a_session_continues_elsewhere_without_states_and_forgets_those_before_a_gap() {
+    let models = Path::new(env!("CARGO_MANIFEST_DIR")).join("models");
+    let model = Arc::new(registry::load(&models.join("rooms")).unwrap());
+    let frame = |index: usize| {
+        let pixel = |at: usize| (100.0 + 80.0 * ((at % 64 + 3 * index) as f32 * 0.4).sin()) as u8;
+        Frame::new(64, 64, (0..64 * 64).map(pixel).collect()).unwrap()
+    };
+    let mut session = Session::new(Arc::clone(&model));
+    let mut predicted = None;
+    for index in 0..5 {
+        predicted = session.step(frame(index), None, None).unwrap();
+    }
+    assert_eq!(predicted.unwrap().frames.len(), 5);
+    let mut again = Session::restore(model, session.snapshot()).unwrap();
+    let next = [session.step(frame(5), None, None), again.step(frame(5), None, None)].map(Result::unwrap);
+    assert!(next[0].is_some() && next[0] == next[1]);
+
+    let state = RobotState::try_from(vec![0.0, 0.0, 1.0, 0.0, 0.2, 0.0]).unwrap();
+    for index in 6..9 {
+        session.step(frame(index), Some(&state), None).unwrap();
+    }
+    assert_eq!(session.snapshot().past_states.len(), 2);
+    session.step(frame(9), None, None).unwrap();
+    session.step(frame(10), Some(&state), None).unwrap();
+    assert!(session.snapshot().past_states.is_empty());
 }
