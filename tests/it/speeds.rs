@@ -1,5 +1,6 @@
 //! Networks that see how fast the camera drives: trained on the simulator, they do without states and actions.
 
+use std::fmt::Write as _;
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
@@ -233,12 +234,8 @@ fn record_car(dir: &Path) {
         let png = codec::encode_png(&drives.frame(frame).unwrap()).unwrap();
         std::fs::write(dir.join(format!("recorded/{frame:04}.png")), png).unwrap();
         let [linear, angular] = [drives.action(frame)[0], drives.action(frame)[1]];
-        table += &format!(
-            "{:.1},{frame:04}.png,{},{}\n",
-            frame as f64 * 0.2,
-            -0.7 * angular,
-            2.0 * linear
-        );
+        let time_s = frame as f64 * 0.2;
+        writeln!(table, "{time_s:.1},{frame:04}.png,{},{}", -0.7 * angular, 2.0 * linear).unwrap();
     }
     std::fs::write(dir.join("recorded/car.csv"), table).unwrap();
     let imported = output(
@@ -270,7 +267,7 @@ fn rooms_is_scored_on_a_car_and_adapted_to_it_unless_it_gets_worse() {
 
     let short = "--set sequence.batch_size=2 --set run.warmup_steps=0 --steps 4";
     let adapted = run(&format!(
-        "adapt car --mirror angle {short} --set sequence.learning_rate=0.0003"
+        "adapt car --mirror action.angle {short} --set sequence.learning_rate=0.0003"
     ));
     let said = format!("{}{}", text(&adapted.stdout), text(&adapted.stderr));
     for part in [

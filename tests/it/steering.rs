@@ -103,7 +103,7 @@ fn a_plan_that_cannot_be_made_says_why() {
             "--at is 2; it must be 4 to 9",
         ),
         (
-            "plan --model rooms --frames look --goal 1,0".to_owned(),
+            "plan --model moving-flow --frames look --goal 1,0".to_owned(),
             "state is missing",
         ),
     ] {
