@@ -81,8 +81,8 @@ pub mod dataset {
         ImportConfig, ImportError, ImportOptions, ImportProgress, Imported, SkippedItem, import,
     };
     pub use foreframe_data::dataset::{
-        CollectConfig, CollectProgress, Dataset, DatasetError, DatasetInfo, DatasetPart, Episode, EpisodeData, Lacking,
-        Split, Splits, Window, WindowShape, collect,
+        CollectConfig, CollectProgress, Dataset, DatasetError, DatasetInfo, DatasetPart, Episode, EpisodeData, Split,
+        Splits, Window, WindowShape, collect,
     };
     pub use foreframe_data::inspection::{
         ActionDelay, ChannelRole, ChannelSummary, ExposureJump, FramePlace, FrameTiming, FrozenSpan, Histogram,
