@@ -76,7 +76,8 @@ pub(super) fn run(args: &AdaptArgs) -> Result<(), CliError> {
     let config = config(args, &base, &dataset)?;
     let run_dir = (args.out.clone()).unwrap_or_else(|| PathBuf::from("runs").join(config.name.as_str()));
     let windows = compared_windows(&base, &dataset)?;
-    let before = mean_error(&base, &dataset, &windows)?;
+    let errors_of = |model: &Model| evaluation::window_errors(model, &dataset, &windows, model.spec().horizon);
+    let before = mean(&errors_of(&base)?);
     let (command, cancelled) = (command_line(), interrupt::flag()?);
     let training = OneTraining {
         dataset: &dataset,
@@ -86,8 +87,8 @@ pub(super) fn run(args: &AdaptArgs) -> Result<(), CliError> {
     };
     let (model_dir, _) = training.run(&config, &run_dir)?;
     let adapted = registry::load(&model_dir)?;
-    let after = mean_error(&adapted, &dataset, &windows)?;
-    let copied = copied_error(&base, &dataset, &windows)?;
+    let after = mean(&errors_of(&adapted)?);
+    let copied = mean(&evaluation::copied_errors(&base, &dataset, &windows)?);
     let e4 = |mse: f64| format!("{:8.1}", mse * 1e4);
     print_line(format!(
         "MSE ×10⁻⁴ on {} validation windows\n{}  the last frame, copied\n{}  {} as it is\n{}  {}",
@@ -188,25 +189,6 @@ fn compared_windows(base: &Model, dataset: &Dataset) -> Result<Vec<Window>, CliE
     Ok(all.into_iter().skip(stride / 2).step_by(stride).collect())
 }
 
-fn mean_error(model: &Model, dataset: &Dataset, windows: &[Window]) -> Result<f64, CliError> {
-    let errors = evaluation::window_errors(model, dataset, windows, model.spec().horizon)?;
-    Ok(errors.iter().sum::<f64>() / errors.len() as f64)
-}
-
-/// The error of the last frame as a prediction of all that follow.
-fn copied_error(base: &Model, dataset: &Dataset, windows: &[Window]) -> Result<f64, CliError> {
-    let (context, horizon) = (base.spec().context, base.spec().horizon);
-    let mut sum = 0.0;
-    for window in windows {
-        let last = dataset.frame(window.first_frame + context - 1)?;
-        for frame in window.first_frame + context..window.first_frame + context + horizon {
-            let truth = dataset.frame(frame)?;
-            let pairs = last.pixels().iter().zip(truth.pixels());
-            let squared: f64 = pairs
-                .map(|(a, b)| ((f64::from(*a) - f64::from(*b)) / 255.0).powi(2))
-                .sum();
-            sum += squared / last.pixels().len() as f64;
-        }
-    }
-    Ok(sum / (windows.len() * horizon) as f64)
+fn mean(errors: &[f64]) -> f64 {
+    errors.iter().sum::<f64>() / errors.len() as f64
 }

@@ -31,8 +31,8 @@ const BRIGHTNESS: RangeInclusive<f64> = 0.1..=3.0;
 /// There are three test sets: trials, start/goal pairs (where robots drive to one goal) and controller gains that training never
 /// saw. Of rooms that are only for tests, all trials are scored. The skill is 1 − MSE / MSE
 /// of the strongest baseline: 1 is perfect, 0 is no better than the baseline. Some baselines learn from the training part of the
-/// data set; for a model that was not trained on it, there is a second skill, against the others. To choose between models or settings, use `--split
-/// validation`; the test sets are for the final numbers.
+/// data set; for a model that was not trained on it, there is a second skill, against the others. To choose between models or
+/// settings, use `--split validation`; the test sets are for the final numbers.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   foreframe evaluate --model paper --dataset static-observer --html

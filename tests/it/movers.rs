@@ -43,7 +43,7 @@ fn config(settings: &[&str]) -> TrainConfig {
     TrainConfig::layered("rooms", None, &settings).unwrap()
 }
 
-fn train(
+pub(crate) fn train(
     config: &TrainConfig,
     dataset: &Dataset,
     run_dir: &Path,

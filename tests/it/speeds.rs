@@ -3,7 +3,6 @@
 use std::fmt::Write as _;
 use std::path::Path;
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
 
 use candle_core::{Device, Tensor};
 use foreframe_core::frame::{Frame, codec};
@@ -13,8 +12,9 @@ use foreframe_core::serving::Session;
 use foreframe_core::types::{Channel, RobotState};
 use foreframe_data::dataset::{Dataset, DatasetInfo, EpisodeData, Lacking, Window};
 use foreframe_train::evaluation::window_errors;
-use foreframe_train::training::{TrainConfig, TrainError, Training, TrainingOutcome, run};
+use foreframe_train::training::TrainConfig;
 
+use crate::movers::train;
 use crate::process::{output, text};
 
 const SIDE: usize = 16;
@@ -83,22 +83,6 @@ fn config(settings: &[&str]) -> TrainConfig {
     ];
     let settings = small.iter().chain(settings).map(|&setting| setting.to_owned());
     TrainConfig::layered("rooms", None, &settings.collect::<Vec<_>>()).unwrap()
-}
-
-fn train(
-    config: &TrainConfig,
-    dataset: &Dataset,
-    run_dir: &Path,
-    start: Option<&StoredWeights>,
-) -> Result<TrainingOutcome, TrainError> {
-    let training = Training {
-        config,
-        dataset,
-        run_dir,
-        command: "foreframe train",
-        start,
-    };
-    run(&training, &mut |_| {}, &AtomicBool::new(false))
 }
 
 #[test]

@@ -37,13 +37,14 @@ pub mod surroundings;
 pub mod uncertainty;
 mod verdict;
 mod visibility;
+mod window_errors;
 mod windows;
 
 use std::time::Instant;
 
 pub use self::calibrate::{calibrate, calibrate_trained};
 #[doc(hidden)]
-pub use self::camera_estimate::{CameraEstimate, estimate_camera, window_errors, windows_of};
+pub use self::camera_estimate::{CameraEstimate, estimate_camera};
 pub use self::compatible::check_fit;
 pub use self::config::{EvaluateConfig, NEAREST_WINDOWS, ScoredSplit};
 #[doc(hidden)]
@@ -54,6 +55,8 @@ pub use self::html::html_page;
 pub use self::output::{prepare, write};
 pub use self::progress::{EvaluationProgress, EvaluationStage};
 pub use self::report::EvaluationReport;
+#[doc(hidden)]
+pub use self::window_errors::{copied_errors, window_errors, windows_of};
 
 use self::baselines::Baselines;
 use self::bootstrap::is_recording;

@@ -60,12 +60,12 @@ impl ConditioningTensors {
     /// The inputs as plain values. Values far outside the training's are limited, so that no prediction is NaN. Errors:
     /// `Missing`, `Shape`.
     pub(super) fn values(&self, spec: &ModelSpec, batch: usize) -> Result<ConditioningValues, NnError> {
-        let told = Self {
+        let given = Self {
             actions: self.actions.clone().or_else(|| spec.unknown_actions(batch)),
             state: self.state.clone().or_else(|| spec.unknown_state(batch)),
             ..Self::none()
         };
-        let [actions, states] = told.used(spec, batch)?;
+        let [actions, states] = given.used(spec, batch)?;
         let limited = |tensor: Option<&Tensor>, channels: &[ChannelScale]| -> Result<Vec<f32>, NnError> {
             let Some(tensor) = tensor else { return Ok(Vec::new()) };
             let values = tensor.flatten_all()?.to_vec1::<f32>()?.into_iter();

@@ -13,8 +13,9 @@
 //! camera saw each of its pixels.
 //!
 //! Reading order: `room_geometry` → `encoder_views` and `rollout_rows` (what the network reads) → `scene` and `motion`, or
-//! `depth_views`, `reprojection`, `depth_head`, `speed_head`, `mover_head` and `occupancy` → `layers` (its tensors) → `network` → `direct`,
-//! `recurrent` and `depth` (its three forms) → `predict` → `beyond_horizon`. `plain` has the same in candle's own tensor operations.
+//! `depth_views`, `reprojection`, `depth_head`, `speed_head`, `mover_head` and `occupancy` → `layers` (its tensors) → `network` →
+//! `direct`, `recurrent` and `depth` (its three forms) → `predict` → `beyond_horizon`. `plain` has the same in candle's own tensor
+//! operations.
 
 mod beyond_horizon;
 mod blocks;

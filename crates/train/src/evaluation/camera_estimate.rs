@@ -1,24 +1,22 @@
 //! Estimates the camera of a recording: the one with which a model that sees depth predicts its frames best.
 
 use super::EvaluationError;
-use super::inference::{ActionSource, Inference};
+use super::statistics::mean_and_deviation;
+use super::window_errors::{window_errors, windows_of};
 use super::windows::evenly;
 use foreframe_core::frame::warp::CameraModel;
 use foreframe_core::registry::Model;
-use foreframe_data::dataset::sampler::{Split, Splits, WindowShape};
-use foreframe_data::dataset::{Dataset, Window};
+use foreframe_data::dataset::Dataset;
+use foreframe_data::dataset::sampler::Split;
 
 /// Training windows that are predicted with each camera.
 const WINDOWS: usize = 48;
-/// Windows that are predicted together.
-const TOGETHER: usize = 16;
 /// Fields of view that are tried first, in degrees.
 const FIELDS_OF_VIEW: [f32; 5] = [50.0, 70.0, 90.0, 110.0, 130.0];
 /// Tilts that are tried first, in degrees.
 const TILTS: [f32; 5] = [-10.0, 0.0, 10.0, 20.0, 30.0];
-/// Half of the distance between them: what is tried around the best one.
-const FINER: f32 = 10.0;
-const FINER_TILT: f32 = 5.0;
+/// What is tried around the best one: half of the distance between those before, of the field of view and of the tilt.
+const FINER: [f32; 2] = [10.0, 5.0];
 /// Standard errors by which the errors of another camera may differ for it to count as possible.
 const POSSIBLE: f64 = 2.0;
 
@@ -43,16 +41,15 @@ struct TriedCamera {
 
 impl TriedCamera {
     fn mean(&self) -> f64 {
-        self.errors.iter().sum::<f64>() / self.errors.len() as f64
+        let [mean, _] = mean_and_deviation(self.errors.iter().copied());
+        mean
     }
 
     /// Whether its errors may be no larger than those of the other.
     fn is_as_good_as(&self, best: &Self) -> bool {
-        let count = self.errors.len() as f64;
-        let differences: Vec<f64> = self.errors.iter().zip(&best.errors).map(|(a, b)| a - b).collect();
-        let mean = differences.iter().sum::<f64>() / count;
-        let variance = differences.iter().map(|value| (value - mean).powi(2)).sum::<f64>() / count;
-        mean <= POSSIBLE * (variance / count).sqrt()
+        let differences = self.errors.iter().zip(&best.errors).map(|(a, b)| a - b);
+        let [mean, deviation] = mean_and_deviation(differences);
+        mean <= POSSIBLE * deviation / (self.errors.len() as f64).sqrt()
     }
 }
 
@@ -75,7 +72,7 @@ pub fn estimate_camera(
     };
     let try_one = |degrees: [f32; 2]| -> Result<TriedCamera, EvaluationError> {
         let with_camera = dataset.clone().with_camera(camera(degrees));
-        // Later steps say less: there, a prediction hedges.
+        // Later steps say less: their pictures blur with any camera.
         let errors = window_errors(loaded, &with_camera, &windows, 1)?;
         Ok(TriedCamera { degrees, errors })
     };
@@ -94,7 +91,7 @@ pub fn estimate_camera(
         [-1.0, 1.0],
         [1.0, -1.0],
     ] {
-        tried.push(try_one([field + more * FINER, tilt + down * FINER_TILT])?);
+        tried.push(try_one([field + more * FINER[0], tilt + down * FINER[1]])?);
     }
     let best = best(&tried);
     let possible = tried.iter().filter(|other| other.is_as_good_as(best));
@@ -115,39 +112,4 @@ pub fn estimate_camera(
 fn best(tried: &[TriedCamera]) -> &TriedCamera {
     let least = tried.iter().min_by(|a, b| a.mean().total_cmp(&b.mean()));
     least.expect("no camera that was tried is a bug")
-}
-
-/// The windows of a split that the model can predict, in order; none if no segment is long enough. Errors: those of [`Splits::windows`].
-pub fn windows_of(loaded: &Model, dataset: &Dataset, split: Split) -> Result<Vec<Window>, EvaluationError> {
-    let spec = loaded.spec();
-    let shape = WindowShape {
-        context: spec.context,
-        horizon: spec.horizon,
-    };
-    let splits = Splits::new(dataset, loaded.manifest.dataset.split_seed);
-    match splits.windows(dataset, split, shape, 1) {
-        Err(foreframe_data::dataset::DatasetError::WindowTooLong { .. }) => Ok(Vec::new()),
-        windows => Ok(windows?),
-    }
-}
-
-/// The mean squared error of each window's first `steps` predicted frames, intensities 0…1. Errors: those of the network and of
-/// [`Dataset::pixels`].
-pub fn window_errors(
-    loaded: &Model,
-    dataset: &Dataset,
-    windows: &[Window],
-    steps: usize,
-) -> Result<Vec<f64>, EvaluationError> {
-    let inference = Inference { loaded, dataset };
-    let each = loaded.spec().horizon * loaded.spec().pixels();
-    let mut errors = Vec::with_capacity(windows.len());
-    for windows in windows.chunks(TOGETHER) {
-        let predicted = inference.predict(windows, ActionSource::Recorded)?;
-        for (&window, frames) in windows.iter().zip(predicted.frames.chunks_exact(each)) {
-            let all = inference.step_errors(window, frames)?;
-            errors.push(all.iter().take(steps).sum::<f64>() / steps as f64);
-        }
-    }
-    Ok(errors)
 }

@@ -78,8 +78,8 @@ impl Default for FlowLayers {
 }
 
 impl FlowSpec {
-    /// Errors: `Camera`, `RecurrentActions`, `RecurrentDepth`, `MoversDepth`, `SpeedsDepth`, `FrameSides` and those of the layers, for a model with
-    /// this conditioning and frames of this width and height.
+    /// Errors: `Camera`, `RecurrentActions`, `RecurrentDepth`, `MoversDepth`, `SpeedsDepth`, `FrameSides` and those of the layers, for a
+    /// model with this conditioning and frames of this width and height.
     pub(super) fn check(&self, conditioning: Conditioning, sides_px: [u32; 2]) -> Result<(), NnError> {
         if let Some(camera) = &self.camera {
             camera.validate().map_err(NnError::Camera)?;
