@@ -90,8 +90,9 @@ fn forecast_batch(
             actions: &predicted.actions[index * actions_each..][..actions_each],
         };
         let expected = |calibration: &Calibration| rollout.expected_errors(calibration);
-        let is_told = has_states_of(spec, inference.dataset);
-        let distance = |state: &[f32]| calibration.distance(spec, &context, is_told.then_some(state), rollout.actions);
+        let has_states = has_states_of(spec, inference.dataset);
+        let distance =
+            |state: &[f32]| calibration.distance(spec, &context, has_states.then_some(state), rollout.actions);
         let dataset = inference.dataset;
         let start = dataset.state(dataset.episodes()[window.episode].first_frame);
         let last = dataset.state(window.first_frame + spec.context - 1);

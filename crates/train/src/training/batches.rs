@@ -60,7 +60,7 @@ pub(super) struct WindowBatch {
     pub(super) condition: ConditioningTensors,
     /// The states at the targets `[B, horizon, S]`, where the data set has states.
     pub(super) future_states: Option<Tensor>,
-    /// The state at the last context frame `[B, S]`, also where the network is not told.
+    /// The state at the last context frame `[B, S]`, also where it is hidden from the network.
     pub(super) measured: Option<Tensor>,
     /// Where movers are in the last context frame and in the targets `[B, 1 + horizon, P]`, where the data set has masks; NaN for
     /// windows of which no masks are known.
@@ -188,7 +188,7 @@ impl<'a> FrameSource<'a> {
         let (acting, last, earlier) = (span(context - 1, horizon), span(context - 1, 1), span(0, context - 1));
         let batched = |frames: Tensor, length: usize| frames.reshape((windows.len(), length, ()));
         let future_inputs = with_future.then(|| inputs(&future)).transpose()?;
-        let told = |hides: fn(Hidden) -> bool, values: Option<Tensor>| told(windows, hides, values);
+        let shown = |hides: fn(Hidden) -> bool, values: Option<Tensor>| without_hidden(windows, hides, values);
         let measured = self.channels(STATE, &last, &[windows.len()])?;
         Ok(WindowBatch {
             inputs: batched(inputs(&past)?, context)?,
@@ -196,12 +196,12 @@ impl<'a> FrameSource<'a> {
             future: future_inputs.map(|frames| batched(frames, horizon)).transpose()?,
             targets: batched(targets(&future)?, horizon)?,
             condition: ConditioningTensors {
-                actions: told(
+                actions: shown(
                     |hidden| hidden == Hidden::All,
                     self.channels(ACTION, &acting, &[windows.len(), horizon])?,
                 )?,
-                state: told(|hidden| hidden != Hidden::Nothing, measured.clone())?,
-                past_states: told(
+                state: shown(|hidden| hidden != Hidden::Nothing, measured.clone())?,
+                past_states: shown(
                     |hidden| hidden != Hidden::Nothing,
                     self.channels(STATE, &earlier, &[windows.len(), context - 1])?,
                 )?,
@@ -247,7 +247,7 @@ impl<'a> FrameSource<'a> {
 }
 
 /// Values of each window, NaN for the windows that hide them.
-fn told(
+fn without_hidden(
     windows: &[DrawnWindow<'_>],
     hides: fn(Hidden) -> bool,
     values: Option<Tensor>,

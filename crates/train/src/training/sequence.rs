@@ -67,17 +67,12 @@ impl<'a> SequenceObjective<'a> {
             let scene = sequence.loss.between(&scene, &batch.targets)?;
             loss = (loss + (scene * sequence.scene_weight)?)?;
         }
+        let squared = |found: &Tensor, truth: &Tensor| Loss::Mse.between(found, truth);
         if sequence.motion_weight > 0.0
             && let (Some(state), Some(future)) = (&batch.measured, &batch.future_states)
             && let Some(truth) = self.plan.spec.measured_motion(state, future)?
         {
-            loss = added(
-                loss,
-                sequence.motion_weight,
-                &predicted.motion,
-                &truth,
-                |found, truth| Loss::Mse.between(found, truth),
-            )?;
+            loss = added(loss, sequence.motion_weight, &predicted.motion, &truth, squared)?;
         }
         if let (Some(movers), Some(truth)) = (&predicted.movers, &batch.movers) {
             let truth = truth.narrow(1, 0, 1 + counting)?.contiguous()?;
@@ -86,9 +81,7 @@ impl<'a> SequenceObjective<'a> {
         if let (Some(speeds), Some(state)) = (&predicted.speeds, &batch.measured)
             && let Some(truth) = self.plan.spec.measured_speeds(state)?
         {
-            loss = added(loss, sequence.speeds_weight, speeds, &truth, |found, truth| {
-                Loss::Mse.between(found, truth)
-            })?;
+            loss = added(loss, sequence.speeds_weight, speeds, &truth, squared)?;
         }
         Ok(loss)
     }
@@ -118,7 +111,7 @@ impl<'a> SequenceObjective<'a> {
     }
 }
 
-/// The loss with another one, which counts those windows whose truth is known, that is nowhere NaN.
+/// The loss plus another one, weighted, of those windows whose truth is known, that is nowhere NaN.
 fn added(
     loss: Tensor,
     weight: f64,

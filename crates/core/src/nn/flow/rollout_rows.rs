@@ -120,11 +120,11 @@ impl<'a> RolloutRows<'a> {
     /// Whether each rollout's states or actions tell a speed.
     pub(super) fn rows_with_known_speeds(&self) -> Vec<bool> {
         let channels = StateChannels::of(self.spec);
-        let told = |row: usize| {
+        let is_known = |row: usize| {
             let measured = channels.measured_in(self.state(row));
             measured.iter().any(Option::is_some) || channels.commands_speed_in(self.actions(row))
         };
-        (0..self.count()).map(told).collect()
+        (0..self.count()).map(is_known).collect()
     }
 
     /// Some of the rollouts.
@@ -208,12 +208,12 @@ impl<'a> RolloutRows<'a> {
 
     /// Whether anything that the layers read of each rollout's state and actions is known.
     pub(super) fn rows_with_known_inputs(&self) -> Vec<bool> {
-        let told = |row: usize| {
+        let is_known = |row: usize| {
             let state = self.state(row);
             let read = self.read.iter().map(|&channel| state[channel]);
             read.chain(self.actions(row).iter().copied()).any(f32::is_finite)
         };
-        (0..self.count()).map(told).collect()
+        (0..self.count()).map(is_known).collect()
     }
 
     /// Per item: the scaled state, the scaled actions up to the step (zero after it) and which step it is, `[M, …]`.
