@@ -9,7 +9,7 @@ use super::progress::ProgressLine;
 use super::settings::CommonArgs;
 use super::workspace::{Workspace, trained_on};
 use foreframe_core::registry;
-use foreframe_train::evaluation::{self, EvaluateConfig};
+use foreframe_train::evaluation::{self, EvaluateConfig, EvaluationProgress};
 
 /// Measure on the validation split which errors to expect of a model, and write it into the model's manifest.
 ///
@@ -19,7 +19,9 @@ use foreframe_train::evaluation::{self, EvaluateConfig};
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   foreframe calibrate --model runs/moving/model --dataset moving-observer
-  foreframe calibrate --model moving-flow")]
+  foreframe calibrate --model moving-flow
+  foreframe calibrate --model runs/without-car/model --dataset rooms --unseen car
+  foreframe calibrate --model runs/rooms/model --dataset rooms --like runs/without-car/model")]
 pub(super) struct CalibrateArgs {
     /// The directory of a model, its name, or NAME@VERSION
     #[arg(long)]
@@ -27,6 +29,14 @@ pub(super) struct CalibrateArgs {
     /// The directory of a data set, or its name in `DATA_DIR/datasets` [default: the scenario that the model was trained on]
     #[arg(long, value_name = "DATASET")]
     dataset: Option<PathBuf>,
+    /// A recording of a robot that the training never saw; may be repeated. Where neither state nor actions are known, as with a robot
+    /// that is new to the model, the bands become wide enough for its errors too
+    #[arg(long, value_name = "DATASET")]
+    unseen: Vec<PathBuf>,
+    /// A model that was trained like this one, but without a robot, and calibrated with --unseen; may be repeated. The bands become at
+    /// least as wide as its
+    #[arg(long, value_name = "MODEL")]
+    like: Vec<String>,
     /// Validation windows at most, spread evenly over the trials
     #[arg(long, default_value_t = EvaluateConfig::default().max_windows)]
     windows: usize,
@@ -47,11 +57,34 @@ pub(super) fn run(args: &CalibrateArgs) -> Result<(), CliError> {
     };
     let progress = ProgressLine::new("windows");
     progress.label("calibrating");
-    let found = evaluation::calibrate(&loaded, &dataset, &config, &|now| {
+    let on_progress = |now: EvaluationProgress| {
         progress.update(now.done as u64, now.total as u64, || format!("{} split", now.split));
-    });
+    };
+    let mut calibration =
+        evaluation::calibrate(&loaded, &dataset, &config, &on_progress).map_err(CliError::not_calibrated)?;
+    if calibration.steps_without_actions.is_empty() && !(args.unseen.is_empty() && args.like.is_empty()) {
+        return Err(CliError::Usage(format!(
+            "{} needs its actions, so it has no bands for robots that it never saw; leave out --unseen and --like",
+            args.model
+        )));
+    }
+    for unseen in &args.unseen {
+        let (_, unseen) = workspace.open_dataset(unseen)?;
+        let widened = evaluation::widen_for_unseen(&loaded, &unseen, &config, &mut calibration, &on_progress);
+        widened.map_err(CliError::not_calibrated)?;
+    }
+    for like in &args.like {
+        let (_, other) = workspace.load_model(like)?;
+        let other = other
+            .manifest
+            .calibration
+            .as_ref()
+            .filter(|other| !other.steps_without_actions.is_empty());
+        let other =
+            other.ok_or_else(|| CliError::Usage(format!("{like} has no bands for robots that it never saw")))?;
+        evaluation::widen_like(&mut calibration, other);
+    }
     progress.finish();
-    let calibration = found.map_err(CliError::not_calibrated)?;
     let windows = calibration.windows;
     registry::record_calibration(&model_dir, calibration)?;
     print_line(format!(

@@ -2,6 +2,7 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, missing_docs)]
 #![allow(clippy::result_large_err, clippy::too_many_lines, clippy::needless_pass_by_value)]
 
+mod adaptation;
 mod architecture;
 mod asyncapi;
 mod audit;

@@ -1,11 +1,10 @@
 //! Networks that see how fast the camera drives: trained on the simulator, they do without states and actions.
 
-use std::fmt::Write as _;
 use std::path::Path;
 use std::sync::Arc;
 
 use candle_core::{Device, Tensor};
-use foreframe_core::frame::{Frame, codec};
+use foreframe_core::frame::Frame;
 use foreframe_core::nn::ConditioningTensors;
 use foreframe_core::registry::{self, StoredWeights};
 use foreframe_core::serving::Session;
@@ -203,82 +202,6 @@ fn nothing_is_hidden_from_a_network_that_cannot_see_speeds() {
     assert!(
         error.contains("data.hidden is 0.5") && error.contains("model.flow.speeds"),
         "{error}"
-    );
-}
-
-/// A recording of a car in a folder: frames of simulated drives, with a steering angle and a throttle of its own kind.
-fn record_car(dir: &Path) {
-    let arguments = "collect --scenario moving-observer --rooms varied --trials 12 --name drives";
-    let collected = output(dir, &arguments.split(' ').collect::<Vec<_>>());
-    assert!(collected.status.success(), "{}", text(&collected.stderr));
-    let drives = Dataset::open(&dir.join("data/datasets/drives")).unwrap();
-    std::fs::create_dir(dir.join("recorded")).unwrap();
-    let mut table = "timestamp,file,action.angle,action.throttle\n".to_owned();
-    for frame in 0..drives.info().frame_count {
-        let png = codec::encode_png(&drives.frame(frame).unwrap()).unwrap();
-        std::fs::write(dir.join(format!("recorded/{frame:04}.png")), png).unwrap();
-        let [linear, angular] = [drives.action(frame)[0], drives.action(frame)[1]];
-        let time_s = frame as f64 * 0.2;
-        writeln!(table, "{time_s:.1},{frame:04}.png,{},{}", -0.7 * angular, 2.0 * linear).unwrap();
-    }
-    std::fs::write(dir.join("recorded/car.csv"), table).unwrap();
-    let imported = output(
-        dir,
-        &["import", "recorded", "--csv", "recorded/car.csv", "--name", "car"],
-    );
-    assert!(imported.status.success(), "{}", text(&imported.stderr));
-}
-
-#[test]
-fn rooms_is_scored_on_a_car_and_adapted_to_it_unless_it_gets_worse() {
-    let dir = tempfile::tempdir().unwrap();
-    record_car(dir.path());
-    let models = Path::new(env!("CARGO_MANIFEST_DIR")).join("models");
-    let run = |arguments: &str| {
-        let own = ["--models-dir", models.to_str().unwrap()];
-        output(dir.path(), &arguments.split(' ').chain(own).collect::<Vec<_>>())
-    };
-    let scored = run("evaluate --model rooms --dataset car --split validation --windows 12 --nearest-windows 40");
-    assert!(scored.status.success(), "{}", text(&scored.stderr));
-    let said = text(&scored.stdout);
-    assert!(
-        said.contains("against baselines that know nothing of this data set"),
-        "{said}"
-    );
-    let refused = run("calibrate --model rooms --dataset car");
-    assert_eq!(refused.status.code(), Some(2));
-    assert!(text(&refused.stderr).contains("angle"), "{}", text(&refused.stderr));
-
-    let short = "--set sequence.batch_size=2 --set run.warmup_steps=0 --steps 4";
-    let adapted = run(&format!(
-        "adapt car --mirror action.angle {short} --set sequence.learning_rate=0.0003"
-    ));
-    let said = format!("{}{}", text(&adapted.stdout), text(&adapted.stderr));
-    for part in [
-        "camera, estimated from",
-        "the last frame, copied",
-        "rooms as it is",
-        "car-adapted",
-    ] {
-        assert!(said.contains(part), "{said}");
-    }
-    // With so large a step, it gets worse.
-    let worse = run(&format!(
-        "adapt car --name worse {short} --set sequence.learning_rate=0.1"
-    ));
-    assert_eq!(worse.status.code(), Some(2), "{}", text(&worse.stdout));
-    assert!(
-        text(&worse.stderr).contains("became no better than rooms"),
-        "{}",
-        text(&worse.stderr)
-    );
-    assert!(!dir.path().join("runs/worse").exists());
-    let refused = run("adapt car --from moving-flow");
-    assert_eq!(refused.status.code(), Some(2));
-    assert!(
-        text(&refused.stderr).contains("start from rooms"),
-        "{}",
-        text(&refused.stderr)
     );
 }
 

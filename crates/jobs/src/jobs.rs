@@ -34,7 +34,7 @@ pub use progress::{JobProgress, Losses};
 pub use queue::Jobs;
 pub use report::JobReporter;
 pub use shared::JobLimits;
-pub use spec::{CollectSpec, EvaluateSpec, ImportSpec, JobSpec, TrainSpec};
+pub use spec::{AdaptSpec, CollectSpec, EvaluateSpec, ImportSpec, JobSpec, TrainSpec};
 pub use state::{JobState, JobTransition};
 
 /// Why a job was refused.

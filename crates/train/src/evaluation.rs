@@ -35,6 +35,7 @@ pub mod skill;
 mod statistics;
 pub mod surroundings;
 pub mod uncertainty;
+mod unseen;
 mod verdict;
 mod visibility;
 mod window_errors;
@@ -55,6 +56,8 @@ pub use self::html::html_page;
 pub use self::output::{prepare, write};
 pub use self::progress::{EvaluationProgress, EvaluationStage};
 pub use self::report::EvaluationReport;
+#[doc(hidden)]
+pub use self::unseen::{widen_for_unseen, widen_like};
 #[doc(hidden)]
 pub use self::window_errors::{copied_errors, window_errors, windows_of};
 

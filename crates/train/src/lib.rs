@@ -5,3 +5,5 @@ pub mod settings;
 pub mod training;
 
 pub mod evaluation;
+
+pub mod adaptation;

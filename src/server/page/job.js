@@ -5,6 +5,9 @@ import { blob, call, get, listen, text } from "./api.js";
 
 const FINAL = ["succeeded", "failed", "cancelled"];
 const isFinal = job => FINAL.includes(job.state);
+// Whether a job trains a model.
+export const isTraining = ({ spec }) => ["train", "adapt"].includes(spec.kind);
+
 export const titleOf = ({ kind, name, model, dataset }) => `${kind} ${name ?? model}${dataset ? ` on ${dataset}` : ""}`;
 
 // Lines of a log that are kept.
@@ -30,7 +33,7 @@ export function useJob(id) {
       if (name !== "job") return false;
       setKnown(now => ({ ...now, job: data }));
       const is_over = isFinal(data);
-      if (data.spec.kind === "train" && (is_over || performance.now() - read_ms > LOSSES_EVERY_MS)) readLosses();
+      if (isTraining(data) && (is_over || performance.now() - read_ms > LOSSES_EVERY_MS)) readLosses();
       return is_over;
     });
     return () => {

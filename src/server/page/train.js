@@ -3,7 +3,7 @@
 import { html, useEffect, useMemo, useState } from "./preact.js";
 import { link, note } from "./address.js";
 import { call, get } from "./api.js";
-import { duration, Log, Progress, Report, ServerPicture, Steer, titleOf, useJob } from "./job.js";
+import { duration, isTraining, Log, Progress, Report, ServerPicture, Steer, titleOf, useJob } from "./job.js";
 import { Models } from "./models.js";
 import { COLORS, Plot } from "./plot.js";
 import { Copy, curl, requests } from "./snippets.js";
@@ -23,9 +23,9 @@ function Trainings({ models, datasets, jobs, parameters }) {
   const [wrong, setWrong] = useState("");
   const submit = spec => call("POST", "/v1/jobs", spec).then(job => { note({ job: job.id }); setWrong(""); }, error => setWrong(error.message));
   if (!datasets) return html`<p class="quiet wait">Loading…</p>`;
-  const chosen = parameters.job ?? jobs.find(({ spec }) => spec.kind === "train")?.id;
+  const chosen = parameters.job ?? jobs.find(isTraining)?.id;
   return html`
-    ${datasets.length ? html`<div class="forms"><${NewTraining} datasets=${datasets} jobs=${jobs} submit=${submit} /><${NewEvaluation} models=${models} datasets=${datasets} submit=${submit} /></div>`
+    ${datasets.length ? html`<div class="forms"><${NewTraining} datasets=${datasets} jobs=${jobs} submit=${submit} />${models.some(canBeAdapted) && html`<${NewAdaptation} models=${models.filter(canBeAdapted)} datasets=${datasets} submit=${submit} />`}<${NewEvaluation} models=${models} datasets=${datasets} submit=${submit} /></div>`
       : html`<div class="empty"><h2>First a data set</h2><p><a href="#data">Collect or import one</a>; then train on it here.</p></div>`}
     <p class="wrong" role="alert">${wrong}</p>
     ${jobs.length > 0 && html`<h2>Jobs</h2><${Jobs} jobs=${jobs} chosen=${chosen} />`}
@@ -119,6 +119,27 @@ function NewTraining({ datasets, jobs, submit }) {
     <div class="actions"><button class="main">Train</button><${Copy} curl=${() => curl("POST", "/v1/jobs", spec)} python=${() => requests("POST", "/v1/jobs", spec)} /></div></form>`;
 }
 
+// Whether a model sees how fast the camera drives, so that it can start on another robot.
+const canBeAdapted = ({ spec }) => Boolean(spec.flow?.speeds);
+
+function NewAdaptation({ models, datasets, submit }) {
+  const [form, setForm] = useState({ mirror: [] });
+  const dataset = datasets.find(({ name }) => name === form.dataset) ?? datasets.find(({ scenario }) => !scenario) ?? datasets[0];
+  const from = form.from ?? models[0].name;
+  const mirror = dataset.actions.map(({ name }) => name).filter(name => form.mirror.includes(name));
+  const spec = { kind: "adapt", name: form.name || `${dataset.name}-adapted`, dataset: dataset.name, from, ...(form.steps && { steps: +form.steps }), ...(mirror.length && { mirror }) };
+  const set = name => event => setForm({ ...form, [name]: event.target.value });
+  const turn = name => () => setForm({ ...form, mirror: form.mirror.includes(name) ? form.mirror.filter(other => other !== name) : [...form.mirror, name] });
+  return html`<form class="card" onSubmit=${event => { event.preventDefault(); submit(spec); }}><h2>New adaptation</h2><div class="form">
+      <label>Data set <select value=${dataset.name} onChange=${set("dataset")}>${datasets.map(({ name }) => html`<option value=${name}>${name}</option>`)}</select></label>
+      <label>Start from <select value=${from} onChange=${set("from")}>${models.map(({ name }) => html`<option value=${name}>${name}</option>`)}</select></label>
+      <label>Name of the model <input value=${form.name} placeholder=${`${dataset.name}-adapted`} pattern="[a-z0-9][a-z0-9\\-]*" onInput=${set("name")} /></label>
+      <label>Steps <input type="number" min="1" max="100000" value=${form.steps} placeholder="1200" onInput=${set("steps")} /></label>
+      ${dataset.actions.length > 0 && html`<fieldset class="wide"><legend>Changes its sign in a mirror</legend>${dataset.actions.map(({ name }) => html`<label><input type="checkbox" checked=${mirror.includes(name)} onChange=${turn(name)} /> ${name}</label>`)}</fieldset>`}
+    </div><p class="quiet">For the recording of a robot that drives: estimates its camera, then trains the model further, about five minutes on two cores. A model that became no better is not published. Mark the actions that steer to the left or right; then half of the windows are mirrored.</p>
+    <div class="actions"><button class="main">Adapt</button><${Copy} curl=${() => curl("POST", "/v1/jobs", spec)} python=${() => requests("POST", "/v1/jobs", spec)} /></div></form>`;
+}
+
 function NewEvaluation({ models, datasets, submit }) {
   const [form, setForm] = useState({});
   const model = form.model ?? models[0]?.name;
@@ -150,9 +171,9 @@ function Watched({ id, jobs }) {
     <h2>${id}: ${titleOf(job.spec)} <span class=${STATES[job.state]}>${job.state}</span></h2>
     <${Progress} job=${job} />
     <div class="actions"><${Steer} job=${job} />
-      ${job.state === "succeeded" && job.spec.kind === "train" && html`<a href=${link("play", { model: job.spec.name })}>play it</a>`}
+      ${job.state === "succeeded" && isTraining(job) && html`<a href=${link("play", { model: job.spec.name })}>play it</a>`}
       ${job.state === "succeeded" && ["collect", "import"].includes(job.spec.kind) && html`<a href=${link("data", { set: job.spec.name })}>open it</a>`}</div>
-    ${job.spec.kind === "train" && html`<${Curves} id=${id} losses=${losses} jobs=${jobs} /><${Sample} id=${id} losses=${losses} />`}
+    ${isTraining(job) && html`<${Curves} id=${id} losses=${losses} jobs=${jobs} /><${Sample} id=${id} losses=${losses} />`}
     <${Report} job=${job} />
     <details><summary>Log</summary><${Log} lines=${lines} /></details>
     <footer><${Copy} curl=${() => curl("GET", `/v1/jobs/${id}/events`, undefined, " -N")} python=${() => requests("GET", `/v1/jobs/${id}`)} /></footer>
@@ -181,7 +202,7 @@ function joined(lines) {
 // The curves of a training on a log scale, and those of others over them.
 function Curves({ id, losses, jobs }) {
   const [others, setOthers] = useState({});
-  const trainings = jobs.filter(job => job.spec.kind === "train" && job.id !== id).slice(0, 8);
+  const trainings = jobs.filter(job => isTraining(job) && job.id !== id).slice(0, 8);
   const toggle = async other => {
     const { [other]: known, ...rest } = others;
     if (known) return setOthers(rest);

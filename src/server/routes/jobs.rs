@@ -95,8 +95,8 @@ struct LossCurves {
     points: Vec<LossRow>,
 }
 
-/// Queues a collection, an import, a training or an evaluation. Each process runs one job at a time. A finished training
-/// publishes the next version of its model. The first version of a name becomes active at once, later ones when they are
+/// Queues a collection, an import, a training, an adaptation or an evaluation. Each process runs one job at a time. A finished
+/// training publishes the next version of its model. The first version of a name becomes active at once, later ones when they are
 /// activated.
 #[utoipa::path(
     post, path = "/v1/jobs",

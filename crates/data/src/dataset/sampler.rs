@@ -73,6 +73,23 @@ impl WindowShape {
     }
 }
 
+/// Of windows in the order of their frames, those that lie in the first so many seconds of what all of them show; all of them for 0 seconds.
+#[must_use]
+pub fn first_seconds(windows: Vec<Window>, shape: WindowShape, period_s: f64, seconds: f64) -> Vec<Window> {
+    if seconds <= 0.0 {
+        return windows;
+    }
+    let (mut shown, mut next) = (0, 0);
+    let lies_inside = move |window: &Window| {
+        // Windows overlap; each frame counts once.
+        let end = window.first_frame + shape.frames();
+        shown += end - next.clamp(window.first_frame, end);
+        next = next.max(end);
+        shown as f64 * period_s <= seconds
+    };
+    windows.into_iter().take_while(lies_inside).collect()
+}
+
 /// `context + horizon` consecutive frames of one episode: the context, then the frames to predict.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct Window {

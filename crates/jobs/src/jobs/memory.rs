@@ -73,7 +73,16 @@ impl JobMemory {
 
     /// Errors: `Invalid` if a training certainly needs more memory than a job can use, and those of an estimate.
     pub(super) async fn check(self, spec: &TrainSpec, objects: &Objects) -> Result<(), JobError> {
-        let (allowed, needed) = (self.limit_mib, self.estimate(spec, objects).await?.memory_mib);
+        self.check_needed(self.estimate(spec, objects).await?.memory_mib)
+    }
+
+    /// Errors: `Invalid` if a training on such a data set certainly needs more memory than a job can use.
+    pub(super) fn check_training(self, config: &TrainConfig, dataset: &DatasetInfo) -> Result<(), JobError> {
+        self.check_needed(training_mib(config, dataset, self.held_mib()))
+    }
+
+    fn check_needed(self, needed: u64) -> Result<(), JobError> {
+        let allowed = self.limit_mib;
         if allowed == 0 || needed <= allowed {
             return Ok(());
         }

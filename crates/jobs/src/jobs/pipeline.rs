@@ -1,11 +1,13 @@
 //! The work of jobs, below the data directory: collections and imports write `datasets/NAME`; a training works in `runs/JOB` and
 //! publishes the next version of its model; an evaluation writes `reports/JOB`.
 
+mod adapt;
 mod collect;
 mod evaluate;
 mod import;
 mod parts;
 mod sweep;
+mod train;
 mod training_report;
 
 use std::error::Error;
@@ -17,14 +19,13 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 use tokio::runtime::Handle;
 
-use self::training_report::TrainingReporter;
-use super::checkpoints::{self, CheckpointSync};
+use super::checkpoints;
 use super::executor::{JobExecutor, JobFailure, JobResult};
 use super::memory::JobMemory;
 use super::report::JobReporter;
 use super::retry_policy::RetryPolicy;
 use super::spec::AvailableInputs;
-use super::{EvaluateSpec, Job, JobError, JobSpec, JobState, TrainSpec, datasets};
+use super::{EvaluateSpec, Job, JobError, JobSpec, JobState, datasets};
 use crate::store::{JobId, Store, StoreError};
 use crate::versions::Versions;
 use foreframe_core::error_text;
@@ -32,7 +33,6 @@ use foreframe_core::nn::device::DeviceName;
 use foreframe_core::types::{DatasetName, ModelName};
 use foreframe_data::dataset::{Dataset, DatasetInfo};
 use foreframe_train::evaluation;
-use foreframe_train::training::{self, CHECKPOINT_FILE, Training, TrainingEvent};
 
 /// What a job can use.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -92,6 +92,7 @@ impl JobExecutor for Pipeline {
                 self.join_sweep(spec, report, &self.retry_policy(report, cancelled))
             }
             JobSpec::Train(spec) => self.train(spec, report, cancelled),
+            JobSpec::Adapt(spec) => self.adapt(spec, report, cancelled),
             JobSpec::Evaluate(spec) => self.evaluate(spec, report, cancelled),
         };
         match result {
@@ -143,6 +144,7 @@ impl Pipeline {
             // How much memory it needs, and which models fit, is known when its data set is made.
             _ if !is_there => Ok(()),
             JobSpec::Train(spec) => self.resources.memory.check(spec, objects).await,
+            JobSpec::Adapt(spec) => self.check_adaptation(spec).await,
             JobSpec::Evaluate(spec) => self.check_evaluation(spec).await,
             JobSpec::Collect(_) | JobSpec::Import(_) => Ok(()),
         }
@@ -191,59 +193,6 @@ impl Pipeline {
             ))),
             // Without a row, the job ended long ago.
             _ => Ok(()),
-        }
-    }
-
-    fn train(&self, spec: &TrainSpec, report: &JobReporter, cancelled: &AtomicBool) -> Result<JobResult, JobFailure> {
-        let config = spec.config().map_err(|error| failed(&error))?;
-        let run = run_key(report.id());
-        report.progress(0, 0, "reading the data set");
-        let retry = self.retry_policy(report, cancelled);
-        retry.run(async || self.prepare_run(&run, report).await)?;
-        let held_mib = self.resources.memory.held_mib() / (1 + spec.mixture.len() as u64);
-        let opened = spec
-            .datasets()
-            .map(|(name, weight)| Ok((self.dataset(name, held_mib, &retry)?, weight)));
-        let opened = opened.collect::<Result<_, JobFailure>>()?;
-        let dataset = Dataset::join(opened, config.lacking()).map_err(|error| failed(&error))?;
-        let training = Training {
-            config: &config,
-            dataset: &dataset,
-            run_dir: &self.store.objects().data_dir().join(&run),
-            command: &request_line(&JobSpec::Train(spec.clone())),
-            start: None,
-        };
-        let mut reporter = TrainingReporter {
-            report,
-            steps: [config.pretrain.steps, config.sequence.steps],
-            train_loss: None,
-        };
-        let mut sync = CheckpointSync::default();
-        let mut observer = |event: TrainingEvent| {
-            reporter.on_event(event);
-            if matches!(event, TrainingEvent::Checkpointed { .. }) {
-                let pushed = self.runtime.block_on(self.store.objects().push(&run, CHECKPOINT_FILE));
-                sync.record(pushed).into_iter().for_each(|line| report.line(line));
-            }
-        };
-        // After an error it continues from the last checkpoint.
-        match retry.repeat_once_free(|| training::run(&training, &mut observer, cancelled))? {
-            training::TrainingOutcome::Interrupted { .. } => Err(JobFailure::Cancelled),
-            training::TrainingOutcome::Finished { model_dir, manifest } => {
-                let steps = (config.pretrain.steps + config.sequence.steps) as u64;
-                report.progress(steps, steps, "calibrating");
-                retry.repeat(|| evaluation::calibrate_trained(&model_dir, &dataset, cancelled))?;
-                report.progress(steps, steps, "publishing");
-                let written = retry.run(async || self.versions.write(report.lease(), &spec.name, &model_dir).await)?;
-                let published = written.ok_or(JobFailure::Cancelled)?;
-                let version = published.version;
-                report.line(format!("published as version {version} of \"{}\"", spec.name));
-                let result = json!({"model": spec.name, "version": version, "metrics": manifest.metrics});
-                Ok(JobResult {
-                    published: Some(published),
-                    ..JobResult::of(result)
-                })
-            }
         }
     }
 

@@ -1,5 +1,6 @@
 //! The specification of a job, checked when it is submitted, so that mistakes are reported at once.
 
+mod adapt;
 mod evaluate;
 mod import;
 mod train;
@@ -12,6 +13,7 @@ use std::str::FromStr;
 use serde::de::{Error as _, IntoDeserializer as _};
 use serde::{Deserialize, Deserializer, Serialize};
 
+pub use self::adapt::AdaptSpec;
 pub use self::evaluate::EvaluateSpec;
 pub use self::import::ImportSpec;
 pub use self::train::TrainSpec;
@@ -42,6 +44,8 @@ pub enum JobSpec {
     Import(ImportSpec),
     /// Train a model on a data set.
     Train(TrainSpec),
+    /// Adapt a model to a robot that it never saw.
+    Adapt(AdaptSpec),
     /// Measure a model on the held-out trials of a data set.
     Evaluate(EvaluateSpec),
 }
@@ -109,7 +113,7 @@ pub struct AvailableInputs<'a> {
 
 impl JobSpec {
     /// All kinds.
-    pub const KINDS: [&'static str; 4] = ["collect", "import", "train", "evaluate"];
+    pub const KINDS: [&'static str; 5] = ["collect", "import", "train", "adapt", "evaluate"];
 
     /// Its kind.
     #[must_use]
@@ -118,6 +122,7 @@ impl JobSpec {
             Self::Collect(_) => "collect",
             Self::Import(_) => "import",
             Self::Train(_) => "train",
+            Self::Adapt(_) => "adapt",
             Self::Evaluate(_) => "evaluate",
         }
     }
@@ -128,7 +133,7 @@ impl JobSpec {
         match self {
             Self::Collect(spec) => Some(&spec.name),
             Self::Import(spec) => Some(&spec.name),
-            Self::Train(_) | Self::Evaluate(_) => None,
+            Self::Train(_) | Self::Adapt(_) | Self::Evaluate(_) => None,
         }
     }
 
@@ -137,6 +142,7 @@ impl JobSpec {
     pub fn made_model(&self) -> Option<&ModelName> {
         match self {
             Self::Train(spec) => Some(&spec.name),
+            Self::Adapt(spec) => Some(&spec.name),
             Self::Collect(_) | Self::Import(_) | Self::Evaluate(_) => None,
         }
     }
@@ -146,6 +152,7 @@ impl JobSpec {
     pub fn after(&self) -> Option<JobId> {
         match self {
             Self::Train(spec) => spec.after,
+            Self::Adapt(spec) => spec.after,
             Self::Evaluate(spec) => spec.after,
             Self::Collect(_) | Self::Import(_) => None,
         }
@@ -158,6 +165,7 @@ impl JobSpec {
             Self::Collect(spec) => vec![&spec.name],
             Self::Import(spec) => vec![&spec.name],
             Self::Train(spec) => spec.datasets().map(|(name, _)| name).collect(),
+            Self::Adapt(spec) => vec![&spec.dataset],
             Self::Evaluate(spec) => vec![&spec.dataset],
         }
     }
@@ -170,6 +178,7 @@ impl JobSpec {
             Self::Collect(spec) => spec.parts().into_iter().map(Self::Collect).collect(),
             Self::Evaluate(spec) => spec.parts().into_iter().map(Self::Evaluate).collect(),
             Self::Import(spec) => spec.parts().into_iter().map(Self::Import).collect(),
+            Self::Adapt(_) => Vec::new(),
         }
     }
 
@@ -180,6 +189,7 @@ impl JobSpec {
             Self::Collect(spec) => spec.check(available),
             Self::Import(spec) => spec.check(available),
             Self::Train(spec) => spec.check(available.datasets),
+            Self::Adapt(spec) => spec.check(available),
             Self::Evaluate(spec) => spec.check(available),
         }
     }
@@ -270,6 +280,10 @@ fn name<'de, D: Deserializer<'de>, N: FromStr<Err = ValueError>>(deserializer: D
 
 fn dataset<'de, D: Deserializer<'de>>(deserializer: D) -> Result<DatasetName, D::Error> {
     named("dataset", deserializer)
+}
+
+fn from<'de, D: Deserializer<'de>>(deserializer: D) -> Result<ModelName, D::Error> {
+    named("from", deserializer)
 }
 
 fn model<'de, D: Deserializer<'de>>(deserializer: D) -> Result<ModelName, D::Error> {

@@ -1,13 +1,15 @@
 //! Estimates the camera of a recording: the one with which a model that sees depth predicts its frames best.
 
+use std::fmt::{self, Display, Formatter};
+
 use super::EvaluationError;
 use super::statistics::mean_and_deviation;
 use super::window_errors::{window_errors, windows_of};
-use super::windows::evenly;
+use super::windows::{evenly, window_shape};
 use foreframe_core::frame::warp::CameraModel;
 use foreframe_core::registry::Model;
 use foreframe_data::dataset::Dataset;
-use foreframe_data::dataset::sampler::Split;
+use foreframe_data::dataset::sampler::{Split, first_seconds};
 
 /// Training windows that are predicted with each camera.
 const WINDOWS: usize = 48;
@@ -33,6 +35,20 @@ pub struct CameraEstimate {
     pub windows: usize,
 }
 
+impl Display for CameraEstimate {
+    fn fmt(&self, formatter: &mut Formatter<'_>) -> fmt::Result {
+        let ([narrowest, widest], [highest, lowest]) = (self.fields_of_view_deg, self.tilts_deg);
+        write!(
+            formatter,
+            "estimated from {} windows: field of view {:.0}° ({narrowest:.0}° to {widest:.0}° fit as well), tilted down by {:.0}° \
+             ({highest:.0}° to {lowest:.0}°)",
+            self.windows,
+            self.camera.horizontal_fov_rad.to_degrees(),
+            self.camera.tilt_down_rad.to_degrees(),
+        )
+    }
+}
+
 /// One that was tried, with the error of each window.
 struct TriedCamera {
     degrees: [f32; 2],
@@ -53,15 +69,18 @@ impl TriedCamera {
     }
 }
 
-/// The camera of a data set whose camera is not known, by its training windows; `height_m` says in which unit distances count.
-/// `None` if no window fits. Errors: `Mismatch`, those of the network and of [`Dataset::pixels`].
+/// The camera of a data set whose camera is not known, by its training windows of the first so many `seconds` (0 for all); `height_m` says in
+/// which unit distances count. `None` if no window fits. Errors: `Mismatch`, those of the network and of [`Dataset::pixels`].
 pub fn estimate_camera(
     loaded: &Model,
     dataset: &Dataset,
     height_m: f32,
+    seconds: f64,
 ) -> Result<Option<CameraEstimate>, EvaluationError> {
     super::compatible::check(loaded, dataset)?;
-    let windows = evenly(&windows_of(loaded, dataset, Split::Train)?, WINDOWS);
+    let (shape, period_s) = (window_shape(loaded.spec()), dataset.info().frame_period_s);
+    let all = windows_of(loaded, dataset, Split::Train)?;
+    let windows = evenly(&first_seconds(all, shape, period_s, seconds), WINDOWS);
     if windows.is_empty() {
         return Ok(None);
     }

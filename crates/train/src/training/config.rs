@@ -47,6 +47,10 @@ pub struct TrainConfig {
 pub struct DataConfig {
     /// Number of training windows, drawn at random, or `"all"`.
     pub windows: WindowBudget,
+    /// Trains only on the first so many seconds of the training split (of each data set of a mixture), to see how much of a recording
+    /// is needed; 0 for all. Only with `windows = "all"`.
+    #[serde(default)]
+    pub first_seconds: f64,
     /// Largest number of validation windows used to choose the best weights.
     pub validation_windows: usize,
     /// The seed of the split into training, validation and test parts.

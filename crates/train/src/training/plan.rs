@@ -8,7 +8,7 @@ use super::{START_KEY, TrainError, Training};
 use foreframe_core::nn::ModelSpec;
 use foreframe_core::nn::spec::MIN_CHANNEL_STD;
 use foreframe_core::registry::{DatasetShare, DatasetStamp, Manifest, ProgramStamp};
-use foreframe_data::dataset::sampler::{Split, Splits};
+use foreframe_data::dataset::sampler::{Split, Splits, first_seconds};
 use foreframe_data::dataset::{Dataset, DatasetPart, Window};
 
 /// What is fixed before the first step: the windows and the model specification.
@@ -29,29 +29,25 @@ pub(super) struct MixturePart {
 
 impl<'a> TrainingPlan<'a> {
     pub(super) fn new(config: &TrainConfig, dataset: &'a Dataset) -> Result<Self, TrainError> {
-        let shape = config.window_shape();
+        let (shape, period_s) = (config.window_shape(), dataset.info().frame_period_s);
         let splits = Splits::new(dataset, config.data.split_seed);
         let available = splits.windows(dataset, Split::Train, shape, 1)?;
         let validation = splits.windows(dataset, Split::Validation, shape, 1)?;
-        let mut train = match config.data.windows {
+        let train = match config.data.windows {
             WindowBudget::Count(count) if !available.is_empty() => {
                 splits.sample(dataset, Split::Train, shape, count, config.seed.derive("windows", 0))?
             }
             _ => available,
         };
-        let parts = dataset.parts();
-        if parts.len() > 1 {
-            // Stable: within a part, they stay in the order in which they were drawn.
-            train.sort_by_key(|window| parts.iter().position(|part| part.episodes.contains(&window.episode)));
-        }
-        let mut mixture = Vec::new();
-        for part in parts {
+        let (mut kept, mut mixture) = (Vec::new(), Vec::new());
+        for part in dataset.parts() {
             let of_part = |windows: &[Window]| -> Vec<Window> {
                 let inside = |window: &&Window| part.episodes.contains(&window.episode);
                 windows.iter().filter(inside).copied().collect()
             };
             let validation = of_part(&validation);
-            let train_windows = of_part(&train).len();
+            let part_train = first_seconds(of_part(&train), shape, period_s, config.data.first_seconds);
+            let train_windows = part_train.len();
             if train_windows == 0 || validation.is_empty() {
                 return Err(TrainError::NoWindows {
                     dataset: part.info.name.clone(),
@@ -61,12 +57,14 @@ impl<'a> TrainingPlan<'a> {
                 });
             }
             let stride = validation.len().div_ceil(config.data.validation_windows).max(1);
+            kept.extend(part_train);
             mixture.push(MixturePart {
                 train_windows,
                 validation: validation.into_iter().step_by(stride).collect(),
                 part,
             });
         }
+        let train = kept;
         let frames = window_frames(&train, shape.context + shape.horizon);
         let spec = config.model_spec(dataset, &frames);
         check_channels(dataset, &spec)?;

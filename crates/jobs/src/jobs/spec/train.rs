@@ -110,10 +110,7 @@ impl TrainSpec {
 
     /// The preset with the job's settings. Errors: `Invalid`, which names the presets or the setting.
     pub(in crate::jobs) fn config(&self) -> Result<TrainConfig, JobError> {
-        let text = toml::to_string(&self.settings).map_err(|error| {
-            let reason = format!("{error}; a setting is a number, a string, true or false, not null");
-            JobError::invalid("settings", reason)
-        })?;
+        let text = settings_text(&self.settings)?;
         let layered = TrainConfig::layered(&self.preset, Some(&text), &[]);
         let config = layered.map_err(|error| match error {
             TrainError::UnknownPreset { .. } => JobError::invalid("preset", error.to_string()),
@@ -124,6 +121,14 @@ impl TrainSpec {
             ..config
         })
     }
+}
+
+/// Settings of a job as TOML. Errors: `Invalid`.
+pub(super) fn settings_text(settings: &serde_json::Map<String, serde_json::Value>) -> Result<String, JobError> {
+    toml::to_string(settings).map_err(|error| {
+        let reason = format!("{error}; a setting is a number, a string, true or false, not null");
+        JobError::invalid("settings", reason)
+    })
 }
 
 #[cfg(test)]

@@ -7,6 +7,8 @@ use foreframe_core::nn::{ArchitectureKind, Conditioning};
 
 /// Largest number of steps of one stage.
 const MAX_STEPS: usize = 10_000_000;
+/// Longest part of a recording to train on, in seconds.
+const MAX_SECONDS: f64 = 1e9;
 /// Largest number of windows or frames in one batch.
 const MAX_BATCH_SIZE: usize = 4096;
 
@@ -41,6 +43,7 @@ impl TrainConfig {
             ("sequence.movers_weight", sequence.movers_weight, 100.0),
             ("sequence.speeds_weight", sequence.speeds_weight, 100.0),
             ("data.hidden", self.data.hidden, 1.0),
+            ("data.first_seconds", self.data.first_seconds, MAX_SECONDS),
             ("data.brightness", self.data.brightness, 0.9),
             ("data.crop", self.data.crop, 0.5),
             ("run.final_learning_rate", run.final_learning_rate, 1.0),
@@ -69,6 +72,12 @@ impl TrainConfig {
         }
         if self.data.windows == WindowBudget::Count(0) {
             return refused("data.windows is 0; it must be at least 1, or \"all\"".to_owned());
+        }
+        if self.data.first_seconds > 0.0 && self.data.windows != WindowBudget::All {
+            return refused(format!(
+                "data.first_seconds is {}; that needs data.windows = \"all\"",
+                self.data.first_seconds
+            ));
         }
         self.validate_together()
     }

@@ -1,0 +1,86 @@
+//! The work of an adaptation: a training that starts from another model's weights. A model that became no better is not published.
+
+use std::sync::atomic::AtomicBool;
+
+use serde_json::json;
+
+use super::super::executor::{JobFailure, JobResult};
+use super::super::report::JobReporter;
+use super::super::{AdaptSpec, JobError, JobSpec, datasets};
+use super::train::TrainingWork;
+use super::{Pipeline, failed};
+use crate::versions::VersionError;
+use foreframe_core::error_text;
+use foreframe_core::registry::{self, Model, StoredWeights};
+use foreframe_train::adaptation::{AdaptError, Adaptation};
+
+impl Pipeline {
+    pub(super) fn adapt(
+        &self,
+        spec: &AdaptSpec,
+        report: &JobReporter,
+        cancelled: &AtomicBool,
+    ) -> Result<JobResult, JobFailure> {
+        let settings = spec.settings().map_err(|error| failed(&error))?;
+        report.progress(0, 0, "reading the data set");
+        let retry = self.retry_policy(report, cancelled);
+        let dataset = self.dataset(&spec.dataset, self.resources.memory.held_mib(), &retry)?;
+        let (base, start) = retry.run(async || self.base(spec).await)?;
+        report.progress(0, 0, "looking at the camera");
+        let adaptation = Adaptation::of(&base, dataset, &settings).map_err(|error| failed(&error))?;
+        if let Some(camera) = &adaptation.camera {
+            report.line(format!("camera, {camera}"));
+        }
+        let work = TrainingWork {
+            spec: JobSpec::Adapt(spec.clone()),
+            config: &adaptation.config,
+            dataset: &adaptation.dataset,
+            start: Some(&start),
+        };
+        let (model_dir, manifest) = self.trained(&work, &retry)?;
+        let adapted = registry::load(&model_dir).map_err(|error| failed(&error))?;
+        let scores = adaptation.judge(&adapted).map_err(|error| failed(&error))?;
+        let table = scores.table(spec.from.as_str(), spec.name.as_str());
+        table.lines().for_each(|line| report.line(line.to_owned()));
+        if !scores.is_better() {
+            return Err(JobFailure::Failed(format!(
+                "{} became no better than {} (MSE {:.6} and {:.6} on {} validation windows), so it is not published; record more, or try \
+                 other steps",
+                spec.name, spec.from, scores.after, scores.before, scores.windows
+            )));
+        }
+        let mut metrics = manifest.metrics;
+        metrics["adaptation"] = json!(scores);
+        self.published(&spec.name, &model_dir, metrics, &retry)
+    }
+
+    /// The model to start from, and its weights.
+    async fn base(&self, spec: &AdaptSpec) -> Result<(Model, StoredWeights), VersionError> {
+        let version = match spec.from_version {
+            Some(version) => version,
+            None => self.versions.active(&spec.from).await?.unwrap_or_default(),
+        };
+        let base = self.versions.load(&spec.from, version).await?;
+        let mut start = registry::load_weights(&self.versions.directory(&spec.from, version).await?)?;
+        start.manifest.name.clone_from(&spec.from);
+        Ok((base, start))
+    }
+
+    /// Errors: `Invalid` if the model cannot be adapted, or not with these settings, or that needs too much memory.
+    pub(super) async fn check_adaptation(&self, spec: &AdaptSpec) -> Result<(), JobError> {
+        // What cannot be read says so when the job runs.
+        let Ok(base) = self.versions.manifest(&spec.from, spec.from_version).await else {
+            return Ok(());
+        };
+        let info = datasets::describe(self.store.objects(), &spec.dataset).await?;
+        let config = spec.settings()?.training(&base, &info).map_err(|error| {
+            let field = match error {
+                AdaptError::NotAdaptable(_) => "from",
+                AdaptError::NoChannel { .. } => "mirror",
+                _ => "settings",
+            };
+            JobError::invalid(field, error_text::with_causes(&error))
+        })?;
+        self.resources.memory.check_training(&config, &info)
+    }
+}

@@ -1,0 +1,189 @@
+//! Adapting a model that sees depth to a robot that it never saw, from a few minutes of that robot's recording: estimates the camera if
+//! nobody says it, trains the model further, and tells whether it became better.
+
+mod error;
+
+use serde::Serialize;
+
+pub use self::error::AdaptError;
+use crate::evaluation::{self, CameraEstimate};
+use crate::settings::SettingsLayer;
+use crate::training::TrainConfig;
+use foreframe_core::error_text::comma_separated;
+use foreframe_core::nn::Conditioning;
+use foreframe_core::registry::{Manifest, Model};
+use foreframe_core::types::ModelName;
+use foreframe_data::dataset::sampler::Split;
+use foreframe_data::dataset::{Dataset, DatasetInfo, Window};
+
+/// Validation windows that choose the weights, at most, and about as many others that judge them.
+const COMPARED_WINDOWS: usize = 100;
+/// Where a camera is taken to be whose height is not known, in metres: distances then count in units of it.
+const HEIGHT_M: f32 = 0.6;
+
+/// How a model is adapted.
+#[derive(Clone, Debug)]
+pub struct AdaptSettings {
+    /// The new model's name.
+    pub name: ModelName,
+    /// Updates, of 16 windows each; the weights with the least validation error are kept.
+    pub steps: u32,
+    /// Channels whose sign changes in a mirror, such as a steering angle. If there are any, half of the training windows are mirrored.
+    pub mirror: Vec<String>,
+    /// Further settings of the training.
+    pub layers: Vec<SettingsLayer>,
+}
+
+impl AdaptSettings {
+    /// Updates, unless others are asked for.
+    pub const STEPS: u32 = 1200;
+
+    /// The settings of the training: those of the base, for what the data set has. Errors: `NotAdaptable`, and those of
+    /// [`TrainConfig::of_model`].
+    pub fn training(&self, base: &Manifest, info: &DatasetInfo) -> Result<TrainConfig, AdaptError> {
+        if !base.spec.sees_speeds() {
+            return Err(AdaptError::NotAdaptable(base.name.clone()));
+        }
+        let channels = info.action_channels.iter().chain(&info.state_channels);
+        let channels: Vec<&str> = channels.map(|channel| channel.name.as_str()).collect();
+        if let Some(unknown) = self.mirror.iter().find(|name| !channels.contains(&name.as_str())) {
+            return Err(AdaptError::NoChannel {
+                name: unknown.clone(),
+                known: comma_separated(&channels),
+            });
+        }
+        let conditioning = match (info.action_channels.is_empty(), info.state_channels.is_empty()) {
+            (false, false) => Conditioning::StateAction,
+            (false, true) => Conditioning::Action,
+            (true, false) => Conditioning::State,
+            (true, true) => Conditioning::None,
+        };
+        let finds_movers = base.spec.flow().is_some_and(|flow| flow.layers.movers) && info.has_masks;
+        let settings = [
+            format!("model.conditioning={conditioning}"),
+            format!("model.flow.movers={finds_movers}"),
+            format!("sequence.steps={}", self.steps),
+            "sequence.learning_rate=0.004".to_owned(),
+            "run.validate_every_steps=50".to_owned(),
+            "data.brightness=0.1".to_owned(),
+            format!("data.validation_windows={COMPARED_WINDOWS}"),
+            "sequence.batch_size=16".to_owned(),
+            "run.batch_parts=2".to_owned(),
+            match self.mirror.as_slice() {
+                [] => "data.mirror=off".to_owned(),
+                channels => format!("data.mirror={channels:?}"),
+            },
+        ];
+        let own = settings.iter().map(|setting| SettingsLayer::assignment(setting));
+        let layers = own.chain(self.layers.iter().cloned().map(Ok));
+        let layers = layers.collect::<Result<Vec<_>, _>>()?;
+        Ok(TrainConfig {
+            name: self.name.clone(),
+            ..TrainConfig::of_model(base, layers)?
+        })
+    }
+}
+
+/// What is known before the training starts.
+pub struct Adaptation<'a> {
+    base: &'a Model,
+    /// The recording, with an estimated camera where none is known.
+    pub dataset: Dataset,
+    /// The estimated camera; `None` where the recording says it, or no window fits.
+    pub camera: Option<CameraEstimate>,
+    /// The settings of the training, which starts from the base's weights.
+    pub config: TrainConfig,
+    /// Windows of the validation split that judge the adapted model.
+    windows: Vec<Window>,
+}
+
+impl<'a> Adaptation<'a> {
+    /// Looks at the recording. Errors: `NotAdaptable`, `NothingToJudge`, those of the settings, of the data set and of the network.
+    pub fn of(base: &'a Model, dataset: Dataset, settings: &AdaptSettings) -> Result<Self, AdaptError> {
+        let config = settings.training(&base.manifest, dataset.info())?;
+        let windows = judging_windows(base, &dataset)?;
+        let mut episodes = 0..dataset.episodes().len();
+        let camera = if episodes.any(|episode| dataset.camera(episode).is_some()) {
+            None
+        } else {
+            evaluation::estimate_camera(base, &dataset, HEIGHT_M, config.data.first_seconds)?
+        };
+        Ok(Self {
+            base,
+            dataset: match &camera {
+                Some(found) => dataset.with_camera(found.camera),
+                None => dataset,
+            },
+            camera,
+            config,
+            windows,
+        })
+    }
+
+    /// How well the adapted model predicts windows that did not choose its weights. Errors: those of the network and of the data set.
+    pub fn judge(&self, adapted: &Model) -> Result<AdaptScores, AdaptError> {
+        let mean_of = |model: &Model| -> Result<f64, AdaptError> {
+            let horizon = model.spec().horizon;
+            Ok(mean(&evaluation::window_errors(
+                model,
+                &self.dataset,
+                &self.windows,
+                horizon,
+            )?))
+        };
+        Ok(AdaptScores {
+            windows: self.windows.len(),
+            copied: mean(&evaluation::copied_errors(self.base, &self.dataset, &self.windows)?),
+            before: mean_of(self.base)?,
+            after: mean_of(adapted)?,
+        })
+    }
+}
+
+/// Mean squared errors, intensities 0…1, on windows of the validation split.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct AdaptScores {
+    /// How many windows.
+    pub windows: usize,
+    /// Of the last frame, as the prediction of all that follow.
+    pub copied: f64,
+    /// Of the model to start from.
+    pub before: f64,
+    /// Of the adapted model.
+    pub after: f64,
+}
+
+impl AdaptScores {
+    /// The errors × 10⁻⁴ as lines of a table, for models of these names.
+    #[must_use]
+    pub fn table(&self, base: &str, adapted: &str) -> String {
+        let e4 = |mse: f64| format!("{:8.1}", mse * 1e4);
+        format!(
+            "MSE ×10⁻⁴ on {} validation windows\n{}  the last frame, copied\n{}  {base} as it is\n{}  {adapted}",
+            self.windows,
+            e4(self.copied),
+            e4(self.before),
+            e4(self.after),
+        )
+    }
+
+    /// Whether the model became better, so that it is worth keeping.
+    #[must_use]
+    pub fn is_better(&self) -> bool {
+        self.after < self.before
+    }
+}
+
+/// Windows of the validation split, evenly spread, between those that choose the weights. Errors: `NothingToJudge` if there is none.
+fn judging_windows(base: &Model, dataset: &Dataset) -> Result<Vec<Window>, AdaptError> {
+    let all = evaluation::windows_of(base, dataset, Split::Validation)?;
+    if all.is_empty() {
+        return Err(AdaptError::NothingToJudge(dataset.info().name.clone()));
+    }
+    let stride = all.len().div_ceil(COMPARED_WINDOWS);
+    Ok(all.into_iter().skip(stride / 2).step_by(stride).collect())
+}
+
+fn mean(errors: &[f64]) -> f64 {
+    errors.iter().sum::<f64>() / errors.len() as f64
+}

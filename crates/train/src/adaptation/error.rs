@@ -1,0 +1,51 @@
+//! Why a model was not adapted.
+
+use foreframe_core::error_kind::{ErrorKind, HasErrorKind};
+use foreframe_core::types::ModelName;
+
+use crate::evaluation::EvaluationError;
+use crate::settings::SettingsError;
+use crate::training::TrainError;
+
+/// What was wrong, and what would be right.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum AdaptError {
+    /// The model needs the channels that it was trained with.
+    #[error(
+        "{0} does not see how fast a camera drives, so it cannot be adapted to another robot; start from rooms, or from a model that was \
+         trained with model.flow.speeds"
+    )]
+    NotAdaptable(ModelName),
+    /// A channel to mirror is not in the recording.
+    #[error("the data set has no channel \"{name}\" whose sign could change in a mirror; it has: {known}")]
+    NoChannel {
+        /// The name that was given.
+        name: String,
+        /// Those that there are.
+        known: String,
+    },
+    /// No window of the validation split fits the model.
+    #[error("the data set \"{0}\" has no windows for validation, by which the adapted model is judged; record more")]
+    NothingToJudge(String),
+    /// The settings cannot be used.
+    #[error(transparent)]
+    Settings(#[from] SettingsError),
+    /// The training was refused.
+    #[error(transparent)]
+    Train(#[from] TrainError),
+    /// The recording could not be predicted.
+    #[error(transparent)]
+    Evaluation(#[from] EvaluationError),
+}
+
+impl HasErrorKind for AdaptError {
+    fn kind(&self) -> ErrorKind {
+        match self {
+            Self::NotAdaptable(_) | Self::NoChannel { .. } | Self::NothingToJudge(_) => ErrorKind::Usage,
+            Self::Settings(error) => error.kind(),
+            Self::Train(error) => error.kind(),
+            Self::Evaluation(error) => error.kind(),
+        }
+    }
+}

@@ -1,0 +1,177 @@
+//! Adapting `rooms` to a car that it never saw, by the command and as a job.
+
+use std::fmt::Write as _;
+use std::path::Path;
+
+use foreframe::server::ServerConfig;
+use foreframe_core::frame::codec;
+use foreframe_data::dataset::Dataset;
+use serde_json::{Value, json};
+
+use crate::process::{output, text};
+use crate::service::{get, poll_until, post, start};
+
+/// A recording of a car in a folder: frames of simulated drives, with a steering angle and a throttle of its own kind.
+fn record_car(dir: &Path) {
+    let arguments = "collect --scenario moving-observer --rooms varied --trials 12 --name drives";
+    let collected = output(dir, &arguments.split(' ').collect::<Vec<_>>());
+    assert!(collected.status.success(), "{}", text(&collected.stderr));
+    let drives = Dataset::open(&dir.join("data/datasets/drives")).unwrap();
+    std::fs::create_dir(dir.join("recorded")).unwrap();
+    let mut table = "timestamp,file,action.angle,action.throttle\n".to_owned();
+    for frame in 0..drives.info().frame_count {
+        let png = codec::encode_png(&drives.frame(frame).unwrap()).unwrap();
+        std::fs::write(dir.join(format!("recorded/{frame:04}.png")), png).unwrap();
+        let [linear, angular] = [drives.action(frame)[0], drives.action(frame)[1]];
+        let time_s = frame as f64 * 0.2;
+        writeln!(table, "{time_s:.1},{frame:04}.png,{},{}", -0.7 * angular, 2.0 * linear).unwrap();
+    }
+    std::fs::write(dir.join("recorded/car.csv"), table).unwrap();
+    let imported = output(
+        dir,
+        &["import", "recorded", "--csv", "recorded/car.csv", "--name", "car"],
+    );
+    assert!(imported.status.success(), "{}", text(&imported.stderr));
+}
+
+#[test]
+fn rooms_is_scored_on_a_car_and_adapted_to_it_unless_it_gets_worse() {
+    let dir = tempfile::tempdir().unwrap();
+    record_car(dir.path());
+    let models = Path::new(env!("CARGO_MANIFEST_DIR")).join("models");
+    let run = |arguments: &str| {
+        let own = ["--models-dir", models.to_str().unwrap()];
+        output(dir.path(), &arguments.split(' ').chain(own).collect::<Vec<_>>())
+    };
+    let scored = run("evaluate --model rooms --dataset car --split validation --windows 12 --nearest-windows 40");
+    assert!(scored.status.success(), "{}", text(&scored.stderr));
+    let said = text(&scored.stdout);
+    assert!(
+        said.contains("against baselines that know nothing of this data set"),
+        "{said}"
+    );
+    let refused = run("calibrate --model rooms --dataset car");
+    assert_eq!(refused.status.code(), Some(2));
+    assert!(text(&refused.stderr).contains("angle"), "{}", text(&refused.stderr));
+
+    let short = "--set sequence.batch_size=2 --set run.warmup_steps=0 --steps 4";
+    let adapted = run(&format!(
+        "adapt car --mirror action.angle {short} --set sequence.learning_rate=0.0003"
+    ));
+    let said = format!("{}{}", text(&adapted.stdout), text(&adapted.stderr));
+    for part in [
+        "camera, estimated from",
+        "the last frame, copied",
+        "rooms as it is",
+        "car-adapted",
+    ] {
+        assert!(said.contains(part), "{said}");
+    }
+    // With so large a step, it gets worse.
+    let worse = run(&format!(
+        "adapt car --name worse {short} --set sequence.learning_rate=0.1"
+    ));
+    assert_eq!(worse.status.code(), Some(2), "{}", text(&worse.stdout));
+    assert!(
+        text(&worse.stderr).contains("became no better than rooms"),
+        "{}",
+        text(&worse.stderr)
+    );
+    assert!(!dir.path().join("runs/worse").exists());
+    let refused = run("adapt car --from moving-flow");
+    assert_eq!(refused.status.code(), Some(2));
+    assert!(
+        text(&refused.stderr).contains("start from rooms"),
+        "{}",
+        text(&refused.stderr)
+    );
+}
+
+#[tokio::test]
+async fn a_job_adapts_rooms_and_publishes_the_model_unless_it_gets_worse() {
+    let dir = tempfile::tempdir().unwrap();
+    record_car(dir.path());
+    let config = ServerConfig {
+        data_dir: dir.path().join("data"),
+        models_dir: Path::new(env!("CARGO_MANIFEST_DIR")).join("models"),
+        ..ServerConfig::default()
+    };
+    let app = start(config, Vec::new());
+    let adapt = |name: &str, learning_rate: f64| {
+        let settings = json!({
+            "sequence": {"batch_size": 2, "learning_rate": learning_rate},
+            "run": {"warmup_steps": 0},
+        });
+        json!({"kind": "adapt", "name": name, "dataset": "car", "steps": 4, "mirror": ["action.angle"], "settings": settings})
+    };
+    let ended = async |body: &Value| {
+        let taken = post(&app, "/v1/jobs", body).await;
+        assert_eq!(taken.status, 202, "{}", taken.json());
+        let path = format!("/v1/jobs/{}", taken.json()["id"].as_str().unwrap());
+        poll_until(async || {
+            let job = get(&app, &path).await.json();
+            ["succeeded", "failed"]
+                .iter()
+                .any(|state| job["state"] == *state)
+                .then_some(job)
+        })
+        .await
+    };
+    let better = ended(&adapt("mycar", 0.0003)).await;
+    assert_eq!(
+        (&better["state"], &better["result"]["version"]),
+        (&json!("succeeded"), &json!(1)),
+        "{better}"
+    );
+    let errors = &better["result"]["metrics"]["adaptation"];
+    assert!(errors["after"].as_f64() < errors["before"].as_f64(), "{errors}");
+    let model = get(&app, "/v1/models/mycar").await.json();
+    assert_eq!(model["spec"]["actions"][0]["name"], "action.angle");
+    let log = get(&app, &format!("/v1/jobs/{}/logs", better["id"].as_str().unwrap())).await;
+    assert!(
+        log.json().to_string().contains("camera, estimated from"),
+        "{}",
+        log.json()
+    );
+
+    let worse = ended(&adapt("worse", 0.1)).await;
+    assert_eq!(worse["state"], "failed");
+    assert!(
+        worse["error"].as_str().unwrap().contains("became no better than rooms"),
+        "{worse}"
+    );
+    assert_eq!(get(&app, "/v1/models/worse").await.status, 404);
+
+    let refused = async |field: &str, value: Value| {
+        let mut body = adapt("x", 0.001);
+        body[field] = value;
+        post(&app, "/v1/jobs", &body).await.detail(422)
+    };
+    assert!(
+        refused("from", json!("moving-flow"))
+            .await
+            .contains("from: moving-flow does not see how fast")
+    );
+    assert!(
+        refused("from", json!("romms"))
+            .await
+            .contains("there is no model \"romms\"")
+    );
+    assert!(refused("from_version", json!(9)).await.starts_with("from_version: "));
+    assert!(
+        refused("dataset", json!("cart"))
+            .await
+            .contains("there is no data set \"cart\"")
+    );
+    assert!(
+        refused("mirror", json!(["angel"]))
+            .await
+            .contains("mirror: the data set has no channel \"angel\"")
+    );
+    assert!(refused("steps", json!(0)).await.starts_with("steps: 0 is out of range"));
+    assert!(
+        refused("settings", json!({"sequence": {"stepps": 1}}))
+            .await
+            .contains("stepps")
+    );
+}
