@@ -125,8 +125,12 @@ async fn a_job_adapts_rooms_and_publishes_the_model_unless_it_gets_worse() {
     );
     let errors = &better["result"]["metrics"]["adaptation"];
     assert!(errors["after"].as_f64() < errors["before"].as_f64(), "{errors}");
-    let model = get(&app, "/v1/models/mycar").await.json();
-    assert_eq!(model["spec"]["actions"][0]["name"], "action.angle");
+    let model = poll_until(async || {
+        let answer = get(&app, "/v1/models/mycar").await;
+        (answer.status == 200).then(|| answer.json())
+    })
+    .await;
+    assert_eq!(model["spec"]["actions"][0]["name"], "action.angle", "{model}");
     let log = get(&app, &format!("/v1/jobs/{}/logs", better["id"].as_str().unwrap())).await;
     assert!(
         log.json().to_string().contains("camera, estimated from"),

@@ -53,8 +53,8 @@ struct JobList {
 #[serde(deny_unknown_fields)]
 #[into_params(parameter_in = Query)]
 struct ListQuery {
-    /// `collect`, `import`, `train` or `evaluate`.
-    #[param(pattern = "^(collect|import|train|evaluate)$")]
+    /// `collect`, `import`, `train`, `adapt` or `evaluate`.
+    #[param(pattern = "^(collect|import|train|adapt|evaluate)$")]
     kind: Option<String>,
     /// `queued`, `running`, `succeeded`, `failed` or `cancelled`.
     state: Option<JobState>,
