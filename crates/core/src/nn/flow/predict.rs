@@ -32,7 +32,8 @@ impl FlowNetwork {
         if self.is_trained() {
             return self.predict_rows(&rows, steps);
         }
-        in_parts(&rows, rows.of_one_context(), |rows| self.predict_rows(rows, steps))
+        // All on threads of the pool, which share the work of a convolution: from another thread, each would be handed over.
+        rayon::scope(|_| in_parts(&rows, rows.of_one_context(), |rows| self.predict_rows(rows, steps)))
     }
 
     fn predict_rows(&self, rows: &RolloutRows, steps: usize) -> Result<FlowPrediction, NnError> {
