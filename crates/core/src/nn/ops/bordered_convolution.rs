@@ -98,11 +98,10 @@ impl<'a> BorderedConvolution<'a> {
             None => image.shape.stride,
         };
         let most = image.places() * TAPS * image.channels * packed.outputs / LEAST_OF_STRIP;
-        let strips = (2..=strips.min(most)).rev();
         // All have the same rows.
-        let strips = strips.filter(|strips| image.height.is_multiple_of(strips * rows)).max();
+        let strips = (2..=strips.min(most)).filter(|strips| image.height.is_multiple_of(strips * rows));
         let strip = ImageGeometry {
-            height: image.height / strips.unwrap_or(1),
+            height: image.height / strips.max().unwrap_or(1),
             ..image
         };
         let form = match patches {

@@ -129,9 +129,10 @@ impl<'a> TiledConvolution<'a> {
             patch: (row * image.pitch() + column) * image.channels,
             output: (row * image.width + column) * outputs,
         };
-        let tiles: Vec<Tile> = firsts(image.height)
-            .flat_map(|row| firsts(image.width).map(move |column| tile(row, column)))
-            .collect();
+        let mut tiles = Vec::with_capacity(image.places() / weights.size.side().pow(2));
+        for row in firsts(image.height) {
+            tiles.extend(firsts(image.width).map(|column| tile(row, column)));
+        }
         Self { weights, image, tiles }
     }
 
