@@ -6,11 +6,13 @@
 // A closure's vector instructions reach what is inlined into it, and only that.
 #![allow(clippy::inline_always)]
 
+use rayon::prelude::*;
+
 use super::blocks::centred;
 use super::encoder_views::EncoderViews;
 use crate::frame::warp::CameraModel;
 use crate::nn::geometry::camera::{Viewer, rotated};
-use crate::nn::ops::sampling::ImageSize;
+use crate::nn::ops::sampling::{ImageSize, OfPlaces, SAMPLED_TOGETHER};
 use crate::vectorized::vectorized;
 
 /// Distance of everything that the floor does not explain, before anything is learned.
@@ -71,12 +73,14 @@ impl DepthViews {
             let known = known(size, &depths);
             let inputs = &mut views.inputs[index * half.pixels() * channels..][..half.pixels() * channels];
             put_blocks(frame, size, inputs, 0);
-            for back in 0..earlier {
+            let each = (0..earlier).into_par_iter().map(|back| {
                 let first = (index * earlier + back) * pixels;
                 let mut seen = contexts.earlier[first..first + pixels].to_vec();
                 count_from(&mut seen, levels);
                 let motion = contexts.motions_back[index * earlier + back];
-                let (moved, shifts) = moved_back(viewer, size, &depths, motion, [frame, &seen]);
+                moved_back(viewer, size, &depths, motion, [frame, &seen])
+            });
+            for (back, (moved, shifts)) in each.collect::<Vec<_>>().into_iter().enumerate() {
                 put_blocks(&moved, size, inputs, 4 * (back + 1));
                 put(&shifts, 2, inputs, 4 * (earlier + 1) + 2 * back);
             }
@@ -142,19 +146,32 @@ fn moved_back(
     vectorized(
         #[inline(always)]
         || {
-            for (pixel, (&ray, &depth)) in rays.iter().zip(depths).enumerate() {
-                let seen_at = |depth: f32| {
-                    let point = [depth * ray[0] - ahead, depth * ray[1] - left, depth * ray[2]];
-                    viewer.project(rotated(point, sin, cos))
-                };
-                let [x, y] = seen_at(depth);
-                if size.shows([x, y]) {
-                    moved[pixel] = size.around(x, y).sample(earlier);
+            let together = rays.chunks(SAMPLED_TOGETHER).zip(depths.chunks(SAMPLED_TOGETHER));
+            for (nth, ((rays, depths), moved)) in together.zip(moved.chunks_mut(SAMPLED_TOGETHER)).enumerate() {
+                let [mut near, mut far] = [[[0.0; SAMPLED_TOGETHER]; 3]; 2];
+                for (at, (ray, depth)) in rays.iter().zip(depths).enumerate() {
+                    [near[0][at], near[1][at], near[2][at]] = ray.map(|part| depth * part);
+                    [far[0][at], far[1][at], far[2][at]] = ray.map(|part| FARTHER * depth * part);
                 }
-                let farther = seen_at(FARTHER * depth);
-                let block = pixel / size.width / 2 * half.width + pixel % size.width / 2;
-                shifts[2 * block] += shift(farther[0] - x);
-                shifts[2 * block + 1] += shift(farther[1] - y);
+                let [mut places, mut farther] = [[[0.0; SAMPLED_TOGETHER]; 2]; 2];
+                for at in 0..SAMPLED_TOGETHER {
+                    let seen_at = |points: &[OfPlaces; 3]| {
+                        let point = [points[0][at] - ahead, points[1][at] - left, points[2][at]];
+                        viewer.project(rotated(point, sin, cos))
+                    };
+                    [places[0][at], places[1][at]] = seen_at(&near);
+                    [farther[0][at], farther[1][at]] = seen_at(&far);
+                }
+                let sampled = size.sample(earlier, &places);
+                for (at, moved) in moved.iter_mut().enumerate() {
+                    let (x, y, pixel) = (places[0][at], places[1][at], nth * SAMPLED_TOGETHER + at);
+                    if size.shows([x, y]) {
+                        *moved = sampled[at];
+                    }
+                    let block = pixel / size.width / 2 * half.width + pixel % size.width / 2;
+                    shifts[2 * block] += shift(farther[0][at] - x);
+                    shifts[2 * block + 1] += shift(farther[1][at] - y);
+                }
             }
         },
     );

@@ -2,7 +2,8 @@
 //!
 //! What depends only on the context is computed once for all rollouts that follow it. Without gradients, each step is then computed
 //! on its own, so that what lies between two layers stays in the processor's cache, many rollouts take no more memory than few, and
-//! several threads compute a single one. In the recurrent form, steps follow each other.
+//! several threads compute a single one. In the recurrent form, steps follow each other. Threads that have no step of their own take
+//! strips of the convolutions of another's.
 
 use std::ops::Range;
 
@@ -32,7 +33,8 @@ impl FlowNetwork {
         if self.is_trained() {
             return self.predict_rows(&rows, steps);
         }
-        in_parts(&rows, rows.of_one_context(), |rows| self.predict_rows(rows, steps))
+        // All on threads of the pool, which share the work of a convolution: from another thread, each would be handed over.
+        rayon::scope(|_| in_parts(&rows, rows.of_one_context(), |rows| self.predict_rows(rows, steps)))
     }
 
     fn predict_rows(&self, rows: &RolloutRows, steps: usize) -> Result<FlowPrediction, NnError> {

@@ -57,7 +57,7 @@ fn predict(
         Some(added) => (with_values(added, <[f32]>::to_vec)?, StartSums::Output),
         None => (vec![0.0; dims.0 * image.places() * outputs], StartSums::Bias),
     };
-    let convolution = BorderedConvolution::new(packed, image);
+    let convolution = BorderedConvolution::in_strips(packed, image, rayon::current_num_threads());
     let mut convolve = |x: &[f32], modulations: &[f32]| {
         let modulations = modulations.chunks_exact(2 * image.channels);
         let items = x
@@ -84,7 +84,7 @@ fn predict(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::nn::gradient_check::noise;
+    use crate::nn::gradient_check::{noise, values};
     use crate::nn::ops::image_geometry::ConvShape;
 
     #[test]
@@ -114,6 +114,34 @@ mod tests {
                 assert_eq!(plain.dims(), packed.dims());
                 let most = (plain - packed).unwrap().abs().unwrap().max_all().unwrap();
                 assert!(most.to_scalar::<f32>().unwrap() < 1e-5, "{shape:?}: {most}");
+            }
+        }
+    }
+
+    #[test]
+    fn any_number_of_threads_gives_the_same_bits() {
+        for (shape, channels) in [
+            (ConvShape::PLAIN, 48),
+            (ConvShape::HALVING, 48),
+            (ConvShape::dilated(2), 48),
+            (ConvShape::PLAIN, 7),
+        ] {
+            let mut layer = Convolution3 {
+                weight: noise(&[9 * channels, 48], 2),
+                bias: noise(&[48], 3),
+                shape,
+                packed: None,
+            };
+            layer.pack().unwrap();
+            let (x, modulation) = (noise(&[2, 32, 32, channels], 1), noise(&[2, 2 * channels], 4));
+            let of_threads = |threads: usize| {
+                let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+                let convolve = || activated_convolution(&layer, &x, Activation::Modulated(&modulation), None);
+                values(&pool.install(convolve).unwrap())
+            };
+            let alone = of_threads(1);
+            for threads in [2, 3, 5, 8] {
+                assert_eq!(of_threads(threads), alone, "{shape:?}, {threads}");
             }
         }
     }

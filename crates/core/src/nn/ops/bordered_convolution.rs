@@ -1,14 +1,20 @@
 //! The convolution of an image with packed weights. The image is written into a larger one with a border of zeros; what is written may
-//! be activated on the way.
+//! be activated on the way. Several threads compute one image in strips of rows, each from a bordered image of its own: the sums of a
+//! place are the same in any strip, to the bit.
 // A closure's vector instructions reach what is inlined into it, and only that.
 #![allow(clippy::inline_always)]
 
-use super::image_geometry::ImageGeometry;
+use rayon::prelude::*;
+
+use super::image_geometry::{ImageGeometry, TAPS};
 use super::modulation::activate;
 use super::packed::{PackedWeights, PlaceInputs, StartSums, TapRun};
 use super::scratch::with_buffers;
-use super::winograd::{PatchWeights, TiledConvolution};
+use super::winograd::{PatchWeights, TileSize, TiledConvolution};
 use crate::vectorized::vectorized;
+
+/// Least multiply–adds of a strip. A smaller one takes hardly longer than it takes to wake a thread.
+const LEAST_OF_STRIP: usize = 1 << 19;
 
 /// The weights of a convolution.
 #[derive(Debug)]
@@ -16,27 +22,31 @@ pub(in crate::nn) struct PackedKernel {
     outputs: usize,
     /// For each place on its own.
     places: Option<PackedWeights>,
-    /// For tiles of 2×2 places, of a convolution without a stride.
-    patches: Option<PatchWeights>,
+    /// For tiles of places, of a convolution without a stride; largest tiles first.
+    patches: Vec<PatchWeights>,
 }
 
 impl PackedKernel {
     /// For images of any size: weights `[9 · C, O]` and a bias `[O]`.
     pub(super) fn new(weights: &[f32], bias: &[f32], stride: usize) -> Self {
+        let sizes = [TileSize::Four, TileSize::Two].into_iter().filter(|_| stride == 1);
         Self {
             outputs: bias.len(),
             places: Some(PackedWeights::new(weights, bias)),
-            patches: (stride == 1).then(|| PatchWeights::new(weights, bias)),
+            patches: sizes.map(|size| PatchWeights::new(size, weights, bias)).collect(),
         }
     }
 
-    /// For images of one size only.
+    /// For images of one size only, with sums that are exact enough for gradients.
     pub(super) fn of_image(weights: &[f32], bias: &[f32], image: ImageGeometry) -> Self {
-        let is_tiled = PatchWeights::fit(image, bias.len());
+        let tiles = Some(TileSize::Two).filter(|size| size.fits(image, bias.len()));
         Self {
             outputs: bias.len(),
-            places: (!is_tiled).then(|| PackedWeights::new(weights, bias)),
-            patches: is_tiled.then(|| PatchWeights::new(weights, bias)),
+            places: tiles.is_none().then(|| PackedWeights::new(weights, bias)),
+            patches: tiles
+                .into_iter()
+                .map(|size| PatchWeights::new(size, weights, bias))
+                .collect(),
         }
     }
 
@@ -56,41 +66,76 @@ pub(super) enum Written<'a> {
 
 /// A convolution of images with a border of zeros.
 pub(super) struct BorderedConvolution<'a> {
-    image: ImageGeometry,
+    /// The rows that one thread computes, as an image.
+    strip: ImageGeometry,
     form: Form<'a>,
 }
 
-/// How the sums are computed.
+/// How the sums of a strip are computed.
 enum Form<'a> {
     Tiles(TiledConvolution<'a>),
     Places(&'a PackedWeights, Vec<TapRun>),
 }
 
 impl<'a> BorderedConvolution<'a> {
+    /// Computes each image on one thread.
     pub(super) fn new(packed: &'a PackedKernel, image: ImageGeometry) -> Self {
-        let patches = packed.patches.as_ref();
-        let patches = patches.filter(|_| PatchWeights::fit(image, packed.outputs));
+        Self::in_strips(packed, image, 1)
+    }
+
+    /// Computes each image in at most that many strips, on the threads of the pool that it is called in.
+    pub(super) fn in_strips(packed: &'a PackedKernel, image: ImageGeometry, strips: usize) -> Self {
+        let mut patches = packed.patches.iter();
+        let patches = patches.find(|patches| patches.size().fits(image, packed.outputs));
         let places = || {
             packed
                 .places
                 .as_ref()
                 .expect("a kernel packed for another image is a bug")
         };
-        let form = match patches {
-            Some(patches) => Form::Tiles(TiledConvolution::new(patches, image)),
-            None => Form::Places(places(), image.runs().collect()),
+        let rows = match patches {
+            Some(patches) => patches.size().side() * image.shape.dilation,
+            None => image.shape.stride,
         };
-        Self { image, form }
+        let most = image.places() * TAPS * image.channels * packed.outputs / LEAST_OF_STRIP;
+        // All have the same rows.
+        let strips = (2..=strips.min(most)).filter(|strips| image.height.is_multiple_of(strips * rows));
+        let strip = ImageGeometry {
+            height: image.height / strips.max().unwrap_or(1),
+            ..image
+        };
+        let form = match patches {
+            Some(patches) => Form::Tiles(TiledConvolution::new(patches, strip)),
+            None => Form::Places(places(), strip.runs().collect()),
+        };
+        Self { strip, form }
     }
 
     /// Computes one item.
     pub(super) fn forward(&self, x: &[f32], out: &mut [f32], start: StartSums, written: Written) {
-        let bordered = (self.image.height + 2 * self.image.shape.dilation) * self.image.pitch() * self.image.channels;
+        let length = self.strip.places() * self.outputs();
+        if out.len() == length {
+            return self.forward_strip(x, 0, out, start, written);
+        }
+        let strips = out.par_chunks_exact_mut(length).enumerate();
+        strips.for_each(|(nth, out)| self.forward_strip(x, nth * self.strip.height, out, start, written));
+    }
+
+    /// Computes the strip of an item that begins at a row of its input.
+    fn forward_strip(&self, x: &[f32], row: usize, out: &mut [f32], start: StartSums, written: Written) {
+        let bordered = (self.strip.height + 2 * self.strip.shape.dilation) * self.strip.pitch() * self.strip.channels;
         let [patches, products] = self.buffers();
         with_buffers([bordered, patches, products], |[bordered, patches, products]| {
-            self.write(bordered, x, written);
+            self.write(bordered, x, row, written);
             self.convolve(bordered, [patches, products], out, start);
         });
+    }
+
+    fn outputs(&self) -> usize {
+        match &self.form {
+            Form::Tiles(tiled) => tiled.outputs(),
+            Form::Places(places, _) => places.outputs(),
+        }
     }
 
     /// Computes one item that has its border.
@@ -109,15 +154,15 @@ impl<'a> BorderedConvolution<'a> {
     }
 
     fn convolve(&self, bordered: &[f32], buffers: [&mut [f32]; 2], out: &mut [f32], start: StartSums) {
-        let ImageGeometry { channels, shape, .. } = self.image;
+        let ImageGeometry { channels, shape, .. } = self.strip;
         let (places, runs) = match &self.form {
             Form::Tiles(tiled) => return tiled.forward(bordered, buffers, out, start),
             Form::Places(places, runs) => (places, runs),
         };
-        let row_length = self.image.out_width() * places.outputs();
+        let row_length = self.strip.out_width() * places.outputs();
         for (row, out) in out.chunks_exact_mut(row_length).enumerate() {
             let inputs = PlaceInputs {
-                values: &bordered[row * shape.stride * self.image.pitch() * channels..],
+                values: &bordered[row * shape.stride * self.strip.pitch() * channels..],
                 step: shape.stride * channels,
                 runs,
             };
@@ -125,20 +170,23 @@ impl<'a> BorderedConvolution<'a> {
         }
     }
 
-    /// Writes an item with its border.
-    fn write(&self, bordered: &mut [f32], x: &[f32], written: Written) {
-        let image = self.image;
-        let (length, pitch) = (image.width * image.channels, image.pitch() * image.channels);
+    /// Writes the rows of an item from `first` on that a strip reads. Places outside the item are zero.
+    fn write(&self, bordered: &mut [f32], x: &[f32], first: usize, written: Written) {
+        let (channels, dilation) = (self.strip.channels, self.strip.shape.dilation);
+        let (length, pitch) = (self.strip.width * channels, self.strip.pitch() * channels);
         vectorized(
             #[inline(always)]
             || {
-                let (above, rest) = bordered.split_at_mut(image.inside());
-                above.fill(0.0);
-                let (rows, below) = rest.split_at_mut(image.height * pitch);
-                below.fill(0.0);
-                for (to, from) in rows.chunks_exact_mut(pitch).zip(x.chunks_exact(length)) {
-                    let (to, between) = to.split_at_mut(length);
-                    between.fill(0.0);
+                for (row, to) in bordered.chunks_exact_mut(pitch).enumerate() {
+                    let from = (first + row).checked_sub(dilation);
+                    let Some(from) = from.and_then(|row| x.get(row * length..(row + 1) * length)) else {
+                        to.fill(0.0);
+                        continue;
+                    };
+                    let (left, to) = to.split_at_mut(dilation * channels);
+                    let (to, right) = to.split_at_mut(length);
+                    left.fill(0.0);
+                    right.fill(0.0);
                     match written {
                         Written::Plain => to.copy_from_slice(from),
                         Written::Silu => {
@@ -147,9 +195,8 @@ impl<'a> BorderedConvolution<'a> {
                             }
                         }
                         Written::Modulated(modulation) => {
-                            let (scale, shift) = modulation.split_at(image.channels);
-                            let places = to.chunks_exact_mut(image.channels);
-                            for (to, from) in places.zip(from.chunks_exact(image.channels)) {
+                            let (scale, shift) = modulation.split_at(channels);
+                            for (to, from) in to.chunks_exact_mut(channels).zip(from.chunks_exact(channels)) {
                                 for (((to, from), scale), shift) in to.iter_mut().zip(from).zip(scale).zip(shift) {
                                     *to = activate(from * (1.0 + scale) + shift);
                                 }
