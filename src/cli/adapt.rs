@@ -94,12 +94,11 @@ pub(super) fn run(args: &AdaptArgs) -> Result<(), CliError> {
 
 /// What the arguments say, for a data set of that name.
 fn settings(args: &AdaptArgs, dataset: &str) -> Result<AdaptSettings, CliError> {
-    let name = match &args.name {
-        Some(name) => name.clone(),
-        None => {
-            let name = format!("{dataset}-adapted").parse();
-            name.map_err(|error: ValueError| CliError::Usage(format!("{error}; give another --name")))?
-        }
+    let name = if let Some(name) = &args.name {
+        name.clone()
+    } else {
+        let name = format!("{dataset}-adapted").parse();
+        name.map_err(|error: ValueError| CliError::Usage(format!("{error}; give another --name")))?
     };
     let layers = args.settings.iter().map(|setting| SettingsLayer::assignment(setting));
     Ok(AdaptSettings {

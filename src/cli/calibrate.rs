@@ -8,7 +8,9 @@ use super::process::print_line;
 use super::progress::ProgressLine;
 use super::settings::CommonArgs;
 use super::workspace::{Workspace, trained_on};
-use foreframe_core::registry;
+use foreframe_core::registry::calibration::Calibration;
+use foreframe_core::registry::{self, Model};
+use foreframe_data::dataset::Dataset;
 use foreframe_train::evaluation::{self, EvaluateConfig, EvaluationProgress};
 
 /// Measure on the validation split which errors to expect of a model, and write it into the model's manifest.
@@ -49,6 +51,7 @@ pub(super) fn run(args: &CalibrateArgs) -> Result<(), CliError> {
     let (model_dir, loaded) = workspace.load_model(&args.model)?;
     let dataset = args.dataset.clone().map_or_else(|| trained_on(&loaded), Ok)?;
     let (_, dataset) = workspace.open_dataset(&dataset)?;
+    let others = Others::open(args, &workspace, &loaded)?;
     let cancelled = interrupt::flag()?;
     let config = EvaluateConfig {
         max_windows: args.windows,
@@ -60,35 +63,58 @@ pub(super) fn run(args: &CalibrateArgs) -> Result<(), CliError> {
     let on_progress = |now: EvaluationProgress| {
         progress.update(now.done as u64, now.total as u64, || format!("{} split", now.split));
     };
-    let mut calibration =
-        evaluation::calibrate(&loaded, &dataset, &config, &on_progress).map_err(CliError::not_calibrated)?;
-    if calibration.steps_without_actions.is_empty() && !(args.unseen.is_empty() && args.like.is_empty()) {
-        return Err(CliError::Usage(format!(
-            "{} needs its actions, so it has no bands for robots that it never saw; leave out --unseen and --like",
-            args.model
-        )));
-    }
-    for unseen in &args.unseen {
-        let (_, unseen) = workspace.open_dataset(unseen)?;
-        let widened = evaluation::widen_for_unseen(&loaded, &unseen, &config, &mut calibration, &on_progress);
-        widened.map_err(CliError::not_calibrated)?;
-    }
-    for like in &args.like {
-        let (_, other) = workspace.load_model(like)?;
-        let other = other
-            .manifest
-            .calibration
-            .as_ref()
-            .filter(|other| !other.steps_without_actions.is_empty());
-        let other =
-            other.ok_or_else(|| CliError::Usage(format!("{like} has no bands for robots that it never saw")))?;
-        evaluation::widen_like(&mut calibration, other);
-    }
+    let found = evaluation::calibrate(&loaded, &dataset, &config, &on_progress).and_then(|mut calibration| {
+        for unseen in &others.unseen {
+            evaluation::widen_for_unseen(&loaded, unseen, &config, &mut calibration, &on_progress)?;
+        }
+        Ok(calibration)
+    });
     progress.finish();
+    let mut calibration = found.map_err(CliError::not_calibrated)?;
+    for like in &others.like {
+        evaluation::widen_like(&mut calibration, like);
+    }
     let windows = calibration.windows;
     registry::record_calibration(&model_dir, calibration)?;
     print_line(format!(
         "{}: calibrated on {windows} validation windows",
         model_dir.display()
     ))
+}
+
+/// What the bands for robots that the model never saw are widened by.
+struct Others {
+    unseen: Vec<Dataset>,
+    like: Vec<Calibration>,
+}
+
+impl Others {
+    /// Opens it before the long work. Errors: `Usage` if the model or the others have no such bands.
+    fn open(args: &CalibrateArgs, workspace: &Workspace, loaded: &Model) -> Result<Self, CliError> {
+        let can_do_without = loaded.spec().sees_speeds() && loaded.spec().action_inputs().is_some();
+        let is_asked = !args.unseen.is_empty() || !args.like.is_empty();
+        if is_asked && !can_do_without {
+            return Err(CliError::Usage(format!(
+                "{} has no bands for robots that it never saw: only models that take actions and can do without them have; leave out \
+                 --unseen and --like",
+                args.model
+            )));
+        }
+        let unseen = args.unseen.iter().map(|dataset| Ok(workspace.open_dataset(dataset)?.1));
+        let like = args.like.iter().map(|model| {
+            let (_, other) = workspace.load_model(model)?;
+            let calibration = other.manifest.calibration.clone();
+            let fitting = calibration.filter(|other| other.steps_without_actions.len() == loaded.spec().horizon);
+            fitting.ok_or_else(|| {
+                CliError::Usage(format!(
+                    "{model} has no bands for robots that it never saw, for {} frames each",
+                    loaded.spec().horizon
+                ))
+            })
+        });
+        Ok(Self {
+            unseen: unseen.collect::<Result<_, CliError>>()?,
+            like: like.collect::<Result<_, _>>()?,
+        })
+    }
 }

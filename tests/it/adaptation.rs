@@ -78,6 +78,52 @@ fn rooms_is_scored_on_a_car_and_adapted_to_it_unless_it_gets_worse() {
         text(&worse.stderr)
     );
     assert!(!dir.path().join("runs/worse").exists());
+    // Bands for robots that it never saw.
+    for option in ["--unseen drives", "--like rooms"] {
+        let calibrated = run(&format!(
+            "calibrate --model runs/car-adapted/model --dataset car --windows 40 {option}"
+        ));
+        assert!(calibrated.status.success(), "{}", text(&calibrated.stderr));
+    }
+    for (command, part) in [
+        (
+            "calibrate --model runs/car-adapted/model --dataset car --unseen car",
+            "was trained on data set \"car\"",
+        ),
+        (
+            "calibrate --model moving-flow --dataset drives --unseen car",
+            "has no bands for robots that it never saw",
+        ),
+        (
+            "calibrate --model runs/car-adapted/model --dataset car --like moving-flow",
+            "has no bands for robots that it never saw",
+        ),
+        ("adapt car --name x --mirror angel", "no channel \"angel\""),
+        (
+            "adapt car --name x --set sequence.steps=5",
+            "sequence.steps cannot be set for an adaptation: use steps",
+        ),
+        (
+            "adapt car --name x --set model.context=4",
+            "model.context cannot be set",
+        ),
+        (
+            "adapt car --name x --set data.first_seconds=1",
+            "data.first_seconds is 1; a window alone takes 2 s",
+        ),
+        (
+            "train --preset recording --dataset car --set data.first_seconds=9 --set data.windows=4",
+            "that needs data.windows = \"all\"",
+        ),
+    ] {
+        let refused = run(command);
+        assert_eq!(refused.status.code(), Some(2), "{command}");
+        assert!(
+            text(&refused.stderr).contains(part),
+            "{command}: {}",
+            text(&refused.stderr)
+        );
+    }
     let refused = run("adapt car --from moving-flow");
     assert_eq!(refused.status.code(), Some(2));
     assert!(

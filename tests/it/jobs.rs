@@ -297,7 +297,7 @@ async fn jobs_are_listed_by_kind_and_state_in_pages() {
     for (query, part) in [
         (
             "kind=dream",
-            "there is no kind \"dream\"; there are: collect, import, train, evaluate",
+            "there is no kind \"dream\"; there are: collect, import, train, adapt, evaluate",
         ),
         ("state=asleep", "unknown variant `asleep`"),
         ("before=7", "\"7\" is not a job id"),
@@ -399,7 +399,7 @@ async fn an_invalid_job_is_refused_at_submission() {
         (
             json!({"kind": "dream"}),
             422,
-            "unknown variant `dream`, expected one of `collect`, `import`, `train`, `evaluate`",
+            "unknown variant `dream`, expected one of `collect`, `import`, `train`, `adapt`, `evaluate`",
         ),
     ] {
         let answer = post(&app, JOBS, &body).await.detail(status);

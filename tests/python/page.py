@@ -276,6 +276,7 @@ def a_dropped_file_is_imported(browser, server):
 def a_training_is_watched(browser, server):
     page = browser.open("train")
     form = page.locator("form", has_text="New training")
+    expect(page.locator("form", has_text="New adaptation").get_by_label("Start from")).to_have_value("rooms")
     form.get_by_label("Preset").locator("option[value=paper]").wait_for(state="attached")
     form.get_by_label("Data set").select_option("room")
     form.get_by_label("Preset").select_option("static")

@@ -44,6 +44,7 @@ impl AdaptSettings {
         if !base.spec.sees_speeds() {
             return Err(AdaptError::NotAdaptable(base.name.clone()));
         }
+        evaluation::check_fit(base, info)?;
         let channels = info.action_channels.iter().chain(&info.state_channels);
         let channels: Vec<&str> = channels.map(|channel| channel.name.as_str()).collect();
         if let Some(unknown) = self.mirror.iter().find(|name| !channels.contains(&name.as_str())) {
@@ -77,9 +78,29 @@ impl AdaptSettings {
         let own = settings.iter().map(|setting| SettingsLayer::assignment(setting));
         let layers = own.chain(self.layers.iter().cloned().map(Ok));
         let layers = layers.collect::<Result<Vec<_>, _>>()?;
+        let config = TrainConfig::of_model(base, layers)?;
+        let shape = config.window_shape();
+        let fixed = "it is that of the model to start from";
+        let rules = [
+            ("model.context", shape.context == base.spec.context, fixed),
+            ("model.horizon", shape.horizon == base.spec.horizon, fixed),
+            (
+                "data.split_seed",
+                config.data.split_seed == base.dataset.split_seed,
+                fixed,
+            ),
+            (
+                "sequence.steps",
+                config.sequence.steps == self.steps as usize,
+                "use steps",
+            ),
+        ];
+        if let Some((setting, _, why)) = rules.into_iter().find(|(_, holds, _)| !holds) {
+            return Err(AdaptError::Fixed(setting, why));
+        }
         Ok(TrainConfig {
             name: self.name.clone(),
-            ..TrainConfig::of_model(base, layers)?
+            ..config
         })
     }
 }
@@ -100,8 +121,13 @@ pub struct Adaptation<'a> {
 impl<'a> Adaptation<'a> {
     /// Looks at the recording. Errors: `NotAdaptable`, `NothingToJudge`, those of the settings, of the data set and of the network.
     pub fn of(base: &'a Model, dataset: Dataset, settings: &AdaptSettings) -> Result<Self, AdaptError> {
-        let config = settings.training(&base.manifest, dataset.info())?;
-        let windows = judging_windows(base, &dataset)?;
+        let mut config = settings.training(&base.manifest, dataset.info())?;
+        let all = evaluation::windows_of(base, &dataset, Split::Validation)?;
+        if all.len() < 2 {
+            return Err(AdaptError::NothingToJudge(dataset.info().name.clone()));
+        }
+        config.data.validation_windows = config.data.validation_windows.clamp(1, all.len() / 2);
+        let windows = judging_windows(&all, config.data.validation_windows);
         let mut episodes = 0..dataset.episodes().len();
         let camera = if episodes.any(|episode| dataset.camera(episode).is_some()) {
             None
@@ -174,16 +200,34 @@ impl AdaptScores {
     }
 }
 
-/// Windows of the validation split, evenly spread, between those that choose the weights. Errors: `NothingToJudge` if there is none.
-fn judging_windows(base: &Model, dataset: &Dataset) -> Result<Vec<Window>, AdaptError> {
-    let all = evaluation::windows_of(base, dataset, Split::Validation)?;
-    if all.is_empty() {
-        return Err(AdaptError::NothingToJudge(dataset.info().name.clone()));
-    }
-    let stride = all.len().div_ceil(COMPARED_WINDOWS);
-    Ok(all.into_iter().skip(stride / 2).step_by(stride).collect())
+/// Of the windows of the validation split, those in the middle between the `choosing` ones that choose the weights: the training takes the
+/// first of each stride.
+fn judging_windows(all: &[Window], choosing: usize) -> Vec<Window> {
+    let stride = all.len().div_ceil(choosing);
+    all.iter().skip(stride / 2).step_by(stride).copied().collect()
 }
 
 fn mean(errors: &[f64]) -> f64 {
     errors.iter().sum::<f64>() / errors.len() as f64
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn no_window_both_chooses_the_weights_and_judges_them() {
+        for count in [2, 3, 71, 100, 199, 200, 201, 1000] {
+            let window = |first_frame| Window {
+                episode: 0,
+                first_frame,
+            };
+            let all: Vec<Window> = (0..count).map(window).collect();
+            let choosing = COMPARED_WINDOWS.min(count / 2);
+            let chosen: Vec<&Window> = all.iter().step_by(count.div_ceil(choosing)).collect();
+            let judging = judging_windows(&all, choosing);
+            assert!(judging.iter().all(|window| !chosen.contains(&window)), "{count}");
+            assert!(judging.len() * 2 >= choosing, "{count}: {}", judging.len());
+        }
+    }
 }

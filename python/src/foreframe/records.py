@@ -367,10 +367,10 @@ class Dataset:
 
 @dataclass(frozen=True)
 class Job:
-    """A job: a collection, an import, a training or an evaluation."""
+    """A job: a collection, an import, a training, an adaptation or an evaluation."""
 
     id: str
-    #: ``collect``, ``import``, ``train`` or ``evaluate``.
+    #: ``collect``, ``import``, ``train``, ``adapt`` or ``evaluate``.
     kind: str
     #: ``queued``, ``running``, ``succeeded``, ``failed`` or ``cancelled``.
     state: str

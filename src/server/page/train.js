@@ -1,4 +1,4 @@
-// Train: trainings and evaluations, their curves and reports, and the models that come of them.
+// Train: trainings, adaptations and evaluations, their curves and reports, and the models that come of them.
 
 import { html, useEffect, useMemo, useState } from "./preact.js";
 import { link, note } from "./address.js";
@@ -126,7 +126,8 @@ function NewAdaptation({ models, datasets, submit }) {
   const [form, setForm] = useState({ mirror: [] });
   const dataset = datasets.find(({ name }) => name === form.dataset) ?? datasets.find(({ scenario }) => !scenario) ?? datasets[0];
   const from = form.from ?? models[0].name;
-  const mirror = dataset.actions.map(({ name }) => name).filter(name => form.mirror.includes(name));
+  const channels = [...new Set([...dataset.actions, ...dataset.states].map(({ name }) => name))];
+  const mirror = channels.filter(name => form.mirror.includes(name));
   const spec = { kind: "adapt", name: form.name || `${dataset.name}-adapted`, dataset: dataset.name, from, ...(form.steps && { steps: +form.steps }), ...(mirror.length && { mirror }) };
   const set = name => event => setForm({ ...form, [name]: event.target.value });
   const turn = name => () => setForm({ ...form, mirror: form.mirror.includes(name) ? form.mirror.filter(other => other !== name) : [...form.mirror, name] });
@@ -135,8 +136,8 @@ function NewAdaptation({ models, datasets, submit }) {
       <label>Start from <select value=${from} onChange=${set("from")}>${models.map(({ name }) => html`<option value=${name}>${name}</option>`)}</select></label>
       <label>Name of the model <input value=${form.name} placeholder=${`${dataset.name}-adapted`} pattern="[a-z0-9][a-z0-9\\-]*" onInput=${set("name")} /></label>
       <label>Steps <input type="number" min="1" max="100000" value=${form.steps} placeholder="1200" onInput=${set("steps")} /></label>
-      ${dataset.actions.length > 0 && html`<fieldset class="wide"><legend>Changes its sign in a mirror</legend>${dataset.actions.map(({ name }) => html`<label><input type="checkbox" checked=${mirror.includes(name)} onChange=${turn(name)} /> ${name}</label>`)}</fieldset>`}
-    </div><p class="quiet">For the recording of a robot that drives: estimates its camera, then trains the model further, about five minutes on two cores. A model that became no better is not published. Mark the actions that steer to the left or right; then half of the windows are mirrored.</p>
+      ${channels.length > 0 && html`<fieldset class="wide"><legend>Changes its sign in a mirror</legend>${channels.map(name => html`<label><input type="checkbox" checked=${mirror.includes(name)} onChange=${turn(name)} /> ${name}</label>`)}</fieldset>`}
+    </div><p class="quiet">For the recording of a robot that drives: estimates its camera, then trains the model further, about five minutes on two cores. A model that became no better is not published. Mark all actions and states that say left or right, such as a steering angle; then half of the windows are mirrored.</p>
     <div class="actions"><button class="main">Adapt</button><${Copy} curl=${() => curl("POST", "/v1/jobs", spec)} python=${() => requests("POST", "/v1/jobs", spec)} /></div></form>`;
 }
 

@@ -73,7 +73,8 @@ impl WindowShape {
     }
 }
 
-/// Of windows in the order of their frames, those that lie in the first so many seconds of what all of them show; all of them for 0 seconds.
+/// Keeps the windows that lie within the first `seconds` of the frames that the windows cover; 0 keeps all. The windows must be in the order
+/// of their frames.
 #[must_use]
 pub fn first_seconds(windows: Vec<Window>, shape: WindowShape, period_s: f64, seconds: f64) -> Vec<Window> {
     if seconds <= 0.0 {
@@ -85,7 +86,7 @@ pub fn first_seconds(windows: Vec<Window>, shape: WindowShape, period_s: f64, se
         let end = window.first_frame + shape.frames();
         shown += end - next.clamp(window.first_frame, end);
         next = next.max(end);
-        shown as f64 * period_s <= seconds
+        shown as f64 * period_s <= seconds * (1.0 + 1e-9)
     };
     windows.into_iter().take_while(lies_inside).collect()
 }
@@ -336,4 +337,23 @@ fn median_period_s(dataset: &Dataset) -> f64 {
 pub(crate) fn median(values: &mut [f64]) -> Option<f64> {
     let middle = values.len() / 2;
     (!values.is_empty()).then(|| *values.select_nth_unstable_by(middle, f64::total_cmp).1)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_first_seconds_count_each_frame_once_and_no_gap() {
+        let shape = WindowShape { context: 2, horizon: 1 };
+        let window = |first_frame| Window {
+            episode: 0,
+            first_frame,
+        };
+        // Frames 0 to 5, and after a gap 10 to 13.
+        let all: Vec<Window> = [0, 1, 2, 3, 10, 11].map(window).to_vec();
+        let kept = |seconds: f64| first_seconds(all.clone(), shape, 0.1, seconds).len();
+        let counts = [0.0, 0.2, 0.3, 0.4, 0.6, 0.8, 0.9, 1.0].map(kept);
+        assert_eq!(counts, [6, 0, 1, 2, 4, 4, 5, 6]);
+    }
 }

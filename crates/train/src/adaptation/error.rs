@@ -25,8 +25,13 @@ pub enum AdaptError {
         /// Those that there are.
         known: String,
     },
-    /// No window of the validation split fits the model.
-    #[error("the data set \"{0}\" has no windows for validation, by which the adapted model is judged; record more")]
+    /// A setting is fixed by the model to start from, or has a field of its own.
+    #[error("{0} cannot be set for an adaptation: {1}")]
+    Fixed(&'static str, &'static str),
+    /// The validation split has too few windows.
+    #[error(
+        "the data set \"{0}\" has fewer than two windows for validation: some choose the weights, others judge the adapted model; record more"
+    )]
     NothingToJudge(String),
     /// The settings cannot be used.
     #[error(transparent)]
@@ -42,7 +47,9 @@ pub enum AdaptError {
 impl HasErrorKind for AdaptError {
     fn kind(&self) -> ErrorKind {
         match self {
-            Self::NotAdaptable(_) | Self::NoChannel { .. } | Self::NothingToJudge(_) => ErrorKind::Usage,
+            Self::NotAdaptable(_) | Self::NoChannel { .. } | Self::Fixed(..) | Self::NothingToJudge(_) => {
+                ErrorKind::Usage
+            }
             Self::Settings(error) => error.kind(),
             Self::Train(error) => error.kind(),
             Self::Evaluation(error) => error.kind(),

@@ -23,11 +23,11 @@ use foreframe_data::dataset::{Dataset, Window};
 /// Training windows from which the look of the contexts is learned, at most.
 const TRAINING_WINDOWS: usize = 3000;
 /// Share of the errors below the band, and above it.
-const TAIL: f64 = 0.05;
+pub(super) const TAIL: f64 = 0.05;
 /// Intervals between the stored quantiles of the distance.
 const QUANTILE_STEPS: usize = 40;
 /// Errors below it count as it, so that their logarithm is finite.
-const LEAST_ERROR: f64 = 1e-9;
+pub(super) const LEAST_ERROR: f64 = 1e-9;
 /// An input that varies less never changes.
 const LEAST_SPREAD: f64 = 2e-4;
 /// Added to the mean squares of the inputs, so that the equations can be solved.

@@ -37,6 +37,16 @@ pub enum EvaluationError {
         /// What it takes or predicts.
         wanted: String,
     },
+    /// The model was trained on a recording that should tell how it does on what it never saw.
+    #[error(
+        "model \"{model}\" was trained on data set \"{dataset}\"; only a recording that it never saw tells how wide its bands must be"
+    )]
+    Seen {
+        /// The model's name.
+        model: ModelName,
+        /// The data set's name.
+        dataset: String,
+    },
     /// Another split would test on what the model was trained on.
     #[error(
         "model \"{model}\" was trained on this data set with split seed {trained}; split seed {given} would test it on frames it was trained on"
@@ -159,6 +169,7 @@ impl HasErrorKind for EvaluationError {
             | Self::Setting { .. }
             | Self::NothingHeldOut { .. }
             | Self::NotCalibrated { .. }
+            | Self::Seen { .. }
             | Self::NoContext { .. } => ErrorKind::Usage,
             Self::OutputExists(_) => ErrorKind::Conflict,
             Self::TrainedOn { .. } | Self::NotFinite { .. } | Self::Frame(_) | Self::Replay(_) | Self::Action(_) => {

@@ -1,6 +1,7 @@
 //! Widens the bands of windows without actions, so that they also hold for robots that the training never saw.
 
 use super::EvaluationError;
+use super::calibrate::{LEAST_ERROR, TAIL};
 use super::compatible;
 use super::config::EvaluateConfig;
 use super::division::Division;
@@ -14,11 +15,8 @@ use foreframe_core::registry::calibration::{Calibration, StepErrors};
 use foreframe_data::dataset::Dataset;
 use foreframe_data::dataset::sampler::{Split, Splits};
 
-/// Share of the errors below the band, and above it.
-const TAIL: f64 = 0.05;
-
 /// Widens them until they hold on the validation split of a recording whose robot the training never saw. Errors: `Mismatch`,
-/// `NothingHeldOut`, `Cancelled`, those of the network.
+/// `Seen`, `NothingHeldOut`, `Cancelled`, those of the network.
 pub fn widen_for_unseen(
     loaded: &Model,
     unseen: &Dataset,
@@ -27,6 +25,12 @@ pub fn widen_for_unseen(
     on_progress: &(dyn Fn(EvaluationProgress) + Sync),
 ) -> Result<(), EvaluationError> {
     compatible::check(loaded, unseen)?;
+    if loaded.manifest.dataset.includes(&unseen.info().content_hash) {
+        return Err(EvaluationError::Seen {
+            model: loaded.manifest.name.clone(),
+            dataset: unseen.info().name.clone(),
+        });
+    }
     let seed = loaded.manifest.dataset.split_seed;
     let splits = Splits::new(unseen, seed);
     let windows = splits.windows(unseen, Split::Validation, window_shape(loaded.spec()), config.stride)?;
@@ -69,13 +73,20 @@ fn factors_of(errors: &StepErrors, found: &[Forecast], step: usize) -> StepError
         mean_factor: 1.0,
         ..errors.clone()
     };
-    let ratio = |forecast: &Forecast| forecast.errors[step] / f64::from(median.expected(&forecast.inputs[step]).mse);
-    let ratios: Vec<f64> = found.iter().map(ratio).collect();
+    let medians = found
+        .iter()
+        .map(|forecast| f64::from(median.expected(&forecast.inputs[step]).mse));
+    let errors = || found.iter().map(|forecast| forecast.errors[step].max(LEAST_ERROR));
+    let ratios: Vec<f64> = errors()
+        .zip(medians.clone())
+        .map(|(error, median)| error / median)
+        .collect();
     StepErrors {
-        mean_factor: rounded(ratios.iter().sum::<f64>() / ratios.len() as f64),
+        // Of all errors together: single windows of which almost nothing was expected would rule the mean of the ratios.
+        mean_factor: rounded(errors().sum::<f64>() / medians.sum::<f64>()),
         low_factor: rounded(quantile(ratios.clone(), TAIL)),
         high_factor: rounded(quantile(ratios, 1.0 - TAIL)),
-        ..median
+        ..median.clone()
     }
 }
 
@@ -95,25 +106,28 @@ mod tests {
     fn bands_grow_to_hold_larger_errors_and_never_shrink() {
         let own = StepErrors {
             intercept: -6.0,
-            weights: vec![0.0; ERROR_INPUTS],
+            weights: [&[1.0][..], &[0.0; ERROR_INPUTS - 1]].concat(),
             mean_factor: 1.1,
             low_factor: 0.5,
             high_factor: 2.0,
         };
         let median = f64::exp(-6.0);
-        let forecast = |index: u32| Forecast {
+        let forecast = |expected: f64, times: f64| Forecast {
             distance: 1.0,
             distance_from_start: None,
-            inputs: vec![[0.0; ERROR_INPUTS]],
-            errors: vec![median * (1.0 + f64::from(index) / 20.0)],
+            inputs: vec![[expected.ln(); ERROR_INPUTS]],
+            errors: vec![median * expected * times],
             expected: Vec::new(),
         };
-        let found: Vec<Forecast> = (0..=100).map(forecast).collect();
+        let usual = (0..=100).map(|index| forecast(1.0, 1.0 + f64::from(index) / 20.0));
+        // Almost nothing was expected of these three, so they hardly count in the mean.
+        let tiny = (0..3).map(|_| forecast(1e-3, 1000.0));
+        let found: Vec<Forecast> = usual.chain(tiny).collect();
         let mut widened = own.clone();
         widen(&mut widened, &factors_of(&own, &found, 0));
         let about = |found: f32, expected: f32| (found - expected).abs() < 0.01;
         assert!(
-            about(widened.mean_factor, 3.5) && about(widened.high_factor, 5.75),
+            about(widened.mean_factor, 3.53) && about(widened.high_factor, 5.9),
             "{widened:?}"
         );
         assert_eq!(widened.low_factor, 0.5);

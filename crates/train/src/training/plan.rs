@@ -48,6 +48,13 @@ impl<'a> TrainingPlan<'a> {
             let validation = of_part(&validation);
             let part_train = first_seconds(of_part(&train), shape, period_s, config.data.first_seconds);
             let train_windows = part_train.len();
+            if train_windows == 0 && config.data.first_seconds > 0.0 && !of_part(&train).is_empty() {
+                return Err(TrainError::Config(format!(
+                    "data.first_seconds is {}; a window alone takes {} s",
+                    config.data.first_seconds,
+                    shape.frames() as f64 * period_s
+                )));
+            }
             if train_windows == 0 || validation.is_empty() {
                 return Err(TrainError::NoWindows {
                     dataset: part.info.name.clone(),

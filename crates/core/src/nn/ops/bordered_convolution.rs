@@ -115,18 +115,18 @@ impl<'a> BorderedConvolution<'a> {
     pub(super) fn forward(&self, x: &[f32], out: &mut [f32], start: StartSums, written: Written) {
         let length = self.strip.places() * self.outputs();
         if out.len() == length {
-            return self.forward_strip(x, 0, out, start, written);
+            return self.forward_strip(x, (0, out), start, written);
         }
         let strips = out.par_chunks_exact_mut(length).enumerate();
-        strips.for_each(|(nth, out)| self.forward_strip(x, nth * self.strip.height, out, start, written));
+        strips.for_each(|strip| self.forward_strip(x, strip, start, written));
     }
 
-    /// Computes the strip of an item that begins at a row of its input.
-    fn forward_strip(&self, x: &[f32], row: usize, out: &mut [f32], start: StartSums, written: Written) {
+    /// Computes the strip of an item with this number.
+    fn forward_strip(&self, x: &[f32], (nth, out): (usize, &mut [f32]), start: StartSums, written: Written) {
         let bordered = (self.strip.height + 2 * self.strip.shape.dilation) * self.strip.pitch() * self.strip.channels;
         let [patches, products] = self.buffers();
         with_buffers([bordered, patches, products], |[bordered, patches, products]| {
-            self.write(bordered, x, row, written);
+            self.write(bordered, x, nth * self.strip.height, written);
             self.convolve(bordered, [patches, products], out, start);
         });
     }

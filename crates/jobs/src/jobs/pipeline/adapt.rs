@@ -10,8 +10,11 @@ use super::super::{AdaptSpec, JobError, JobSpec, datasets};
 use super::train::TrainingWork;
 use super::{Pipeline, failed};
 use crate::versions::VersionError;
+use foreframe_core::error_kind::{ErrorKind, HasErrorKind as _};
 use foreframe_core::error_text;
 use foreframe_core::registry::{self, Model, StoredWeights};
+use foreframe_core::types::ModelName;
+use foreframe_data::dataset::DatasetInfo;
 use foreframe_train::adaptation::{AdaptError, Adaptation};
 
 impl Pipeline {
@@ -25,9 +28,13 @@ impl Pipeline {
         report.progress(0, 0, "reading the data set");
         let retry = self.retry_policy(report, cancelled);
         let dataset = self.dataset(&spec.dataset, self.resources.memory.held_mib(), &retry)?;
-        let (base, start) = retry.run(async || self.base(spec).await)?;
-        report.progress(0, 0, "looking at the camera");
-        let adaptation = Adaptation::of(&base, dataset, &settings).map_err(|error| failed(&error))?;
+        let version = match (spec.from_version, spec.after) {
+            (None, Some(after)) => retry.run(async || self.made_version(after, &spec.from).await)?,
+            (version, _) => version,
+        };
+        let (base, start) = retry.run(async || self.base(&spec.from, version).await)?;
+        report.progress(0, 0, "looking at the recording");
+        let adaptation = retry.repeat(|| Adaptation::of(&base, dataset.clone(), &settings))?;
         if let Some(camera) = &adaptation.camera {
             report.line(format!("camera, {camera}"));
         }
@@ -38,8 +45,10 @@ impl Pipeline {
             start: Some(&start),
         };
         let (model_dir, manifest) = self.trained(&work, &retry)?;
-        let adapted = registry::load(&model_dir).map_err(|error| failed(&error))?;
-        let scores = adaptation.judge(&adapted).map_err(|error| failed(&error))?;
+        let steps = u64::from(spec.steps);
+        report.progress(steps, steps, "comparing");
+        let adapted = retry.repeat(|| registry::load(&model_dir))?;
+        let scores = retry.repeat(|| adaptation.judge(&adapted))?;
         let table = scores.table(spec.from.as_str(), spec.name.as_str());
         table.lines().for_each(|line| report.line(line.to_owned()));
         if !scores.is_better() {
@@ -49,34 +58,46 @@ impl Pipeline {
                 spec.name, spec.from, scores.after, scores.before, scores.windows
             )));
         }
+        report.progress(steps, steps, "publishing");
         let mut metrics = manifest.metrics;
         metrics["adaptation"] = json!(scores);
-        self.published(&spec.name, &model_dir, metrics, &retry)
+        self.published(&spec.name, &model_dir, &metrics, &retry)
     }
 
-    /// The model to start from, and its weights.
-    async fn base(&self, spec: &AdaptSpec) -> Result<(Model, StoredWeights), VersionError> {
-        let version = match spec.from_version {
+    /// The model to start from, and its weights; without a version, the active one.
+    async fn base(&self, name: &ModelName, version: Option<u32>) -> Result<(Model, StoredWeights), VersionError> {
+        let version = match version {
             Some(version) => version,
-            None => self.versions.active(&spec.from).await?.unwrap_or_default(),
+            None => self.versions.active(name).await?.unwrap_or_default(),
         };
-        let base = self.versions.load(&spec.from, version).await?;
-        let mut start = registry::load_weights(&self.versions.directory(&spec.from, version).await?)?;
-        start.manifest.name.clone_from(&spec.from);
+        let base = self.versions.load(name, version).await?;
+        let mut start = registry::load_weights(&self.versions.directory(name, version).await?)?;
+        start.manifest.name.clone_from(name);
         Ok((base, start))
     }
 
     /// Errors: `Invalid` if the model cannot be adapted, or not with these settings, or that needs too much memory.
     pub(super) async fn check_adaptation(&self, spec: &AdaptSpec) -> Result<(), JobError> {
-        // What cannot be read says so when the job runs.
-        let Ok(base) = self.versions.manifest(&spec.from, spec.from_version).await else {
+        // The job before it may make the version that is meant.
+        if spec.from_version.is_none() && spec.after.is_some() {
             return Ok(());
+        }
+        let base = match self.versions.manifest(&spec.from, spec.from_version).await {
+            Ok(base) => base,
+            Err(error) if error.kind() == ErrorKind::Away => return Err(error.into()),
+            // What cannot be read says so when the job runs.
+            Err(_) => return Ok(()),
         };
-        let info = datasets::describe(self.store.objects(), &spec.dataset).await?;
+        let info = DatasetInfo {
+            // The caller knows it by this name.
+            name: spec.dataset.to_string(),
+            ..datasets::describe(self.store.objects(), &spec.dataset).await?
+        };
         let config = spec.settings()?.training(&base, &info).map_err(|error| {
             let field = match error {
                 AdaptError::NotAdaptable(_) => "from",
                 AdaptError::NoChannel { .. } => "mirror",
+                AdaptError::Evaluation(_) => "dataset",
                 _ => "settings",
             };
             JobError::invalid(field, error_text::with_causes(&error))

@@ -134,7 +134,7 @@ impl Pipeline {
     }
 
     /// The version of a model that a job made, if it made one.
-    async fn made_version(&self, job: JobId, model: &ModelName) -> Result<Option<u32>, StoreError> {
+    pub(super) async fn made_version(&self, job: JobId, model: &ModelName) -> Result<Option<u32>, StoreError> {
         let row = self.store.job(job).await?;
         let outcome: Option<Value> = row.and_then(|row| serde_json::from_str(&row.outcome?).ok());
         let made = outcome.filter(|outcome| outcome["model"] == model.as_str());

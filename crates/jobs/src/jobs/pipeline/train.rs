@@ -57,7 +57,9 @@ impl Pipeline {
             start: None,
         };
         let (model_dir, manifest) = self.trained(&work, &retry)?;
-        self.published(&spec.name, &model_dir, manifest.metrics, &retry)
+        let steps = work.steps().iter().sum::<usize>() as u64;
+        report.progress(steps, steps, "publishing");
+        self.published(&spec.name, &model_dir, &manifest.metrics, &retry)
     }
 
     /// Trains, or continues, and calibrates. Returns the model's directory and its description.
@@ -96,7 +98,6 @@ impl Pipeline {
                 let steps = work.steps().iter().sum::<usize>() as u64;
                 report.progress(steps, steps, "calibrating");
                 retry.repeat(|| evaluation::calibrate_trained(&model_dir, work.dataset, cancelled))?;
-                report.progress(steps, steps, "publishing");
                 Ok((model_dir, manifest))
             }
         }
@@ -107,7 +108,7 @@ impl Pipeline {
         &self,
         name: &ModelName,
         model_dir: &Path,
-        metrics: Value,
+        metrics: &Value,
         retry: &RetryPolicy<'_>,
     ) -> Result<JobResult, JobFailure> {
         let report = retry.report;
