@@ -180,7 +180,7 @@ pub struct AdaptScores {
 }
 
 impl AdaptScores {
-    /// The errors × 10⁻⁴ as lines of a table, for models of these names.
+    /// The errors in units of 10⁻⁴ as lines of a table, for models of these names.
     #[must_use]
     pub fn table(&self, base: &str, adapted: &str) -> String {
         let e4 = |mse: f64| format!("{:8.1}", mse * 1e4);

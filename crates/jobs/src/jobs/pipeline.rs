@@ -1,5 +1,5 @@
-//! The work of jobs, below the data directory: collections and imports write `datasets/NAME`; a training works in `runs/JOB` and
-//! publishes the next version of its model; an evaluation writes `reports/JOB`.
+//! The work of jobs, below the data directory: collections and imports write `datasets/NAME`; a training or an adaptation works in
+//! `runs/JOB` and publishes the next version of its model; an evaluation writes `reports/JOB`.
 
 mod adapt;
 mod collect;
@@ -19,14 +19,13 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 use tokio::runtime::Handle;
 
-use super::checkpoints;
 use super::executor::{JobExecutor, JobFailure, JobResult};
 use super::memory::JobMemory;
 use super::report::JobReporter;
 use super::retry_policy::RetryPolicy;
 use super::spec::AvailableInputs;
 use super::{EvaluateSpec, Job, JobError, JobSpec, JobState, datasets};
-use crate::store::{JobId, Store, StoreError};
+use crate::store::{JobId, Store};
 use crate::versions::Versions;
 use foreframe_core::error_text;
 use foreframe_core::nn::device::DeviceName;
@@ -194,15 +193,6 @@ impl Pipeline {
             // Without a row, the job ended long ago.
             _ => Ok(()),
         }
-    }
-
-    /// Prepares the run's directory: empty at the first attempt, else with the latest checkpoint.
-    async fn prepare_run(&self, run: &str, report: &JobReporter) -> Result<(), StoreError> {
-        let objects = self.store.objects();
-        if report.lease().token == 1 {
-            return objects.delete(run).await;
-        }
-        checkpoints::fetch_latest(objects, run).await
     }
 
     /// Opens a data set with at most `held_mib` MiB of its frames in memory.

@@ -80,12 +80,8 @@ pub(super) struct SeenPlaces {
 impl SeenPlaces {
     pub(super) fn of(places: &[f32], size: ImageSize) -> Self {
         let pixels = places.chunks_exact(PLACE_VALUES);
-        let mut room = Vec::with_capacity(2 * pixels.len());
-        for place in pixels.clone() {
-            room.extend_from_slice(&place[2..4]);
-        }
         Self {
-            room,
+            room: pixels.clone().flat_map(|place| [place[2], place[3]]).collect(),
             coarse: coarse_places(places, PLACE_VALUES, 2, size),
             inverse_depths: pixels.map(|place| 1.0 / place[4].max(LEAST_DEPTH_M)).collect(),
         }

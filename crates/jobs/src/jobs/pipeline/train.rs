@@ -5,13 +5,14 @@ use std::sync::atomic::AtomicBool;
 
 use serde_json::{Value, json};
 
-use super::super::checkpoints::CheckpointSync;
+use super::super::checkpoints::{self, CheckpointSync};
 use super::super::executor::{JobFailure, JobResult};
 use super::super::report::JobReporter;
 use super::super::retry_policy::RetryPolicy;
 use super::super::{JobSpec, TrainSpec};
 use super::training_report::TrainingReporter;
 use super::{Pipeline, failed, request_line, run_key};
+use crate::store::StoreError;
 use foreframe_core::registry::{Manifest, StoredWeights};
 use foreframe_core::types::ModelName;
 use foreframe_data::dataset::Dataset;
@@ -101,6 +102,15 @@ impl Pipeline {
                 Ok((model_dir, manifest))
             }
         }
+    }
+
+    /// Prepares the run's directory: empty at the first attempt, else with the latest checkpoint.
+    async fn prepare_run(&self, run: &str, report: &JobReporter) -> Result<(), StoreError> {
+        let objects = self.store.objects();
+        if report.lease().token == 1 {
+            return objects.delete(run).await;
+        }
+        checkpoints::fetch_latest(objects, run).await
     }
 
     /// Publishes a trained model as the next version of that name.

@@ -36,7 +36,7 @@ pub struct AdaptSpec {
     pub from_version: Option<u32>,
     /// Updates, of 16 windows each, 1 to 100,000; the weights with the least validation error are kept.
     #[serde(default = "default_steps")]
-    #[schema(minimum = 1, maximum = 100_000, default = 1200)]
+    #[schema(minimum = 1, maximum = 100_000, default = default_steps)]
     pub steps: u32,
     /// Channels whose sign changes in a mirror, such as a steering angle. If there are any, half of the training windows are
     /// mirrored.
