@@ -438,20 +438,26 @@ class FlowNetwork:
             z = z + inner
         return z
 
-    def drawn(self, z, last, beside, content, room, turned):
-        """The frame of a state: pixels of the last frame, moved in two ways, and content, mixed."""
+    def drawn(self, z, last, beside, content, room, turned, remembered=None):
+        """The frame of a state: pixels of the last frame, moved in two ways, and content, mixed; and then with what is remembered."""
         enlarged = shuffle(dense(silu(z), self.tensors, "flow.enlarge"))
         inside = (outside(room, self.shape) == 0).astype(np.float32)[..., None]
         moved_pixels = unshuffle(sample(last, room)[..., None])
         share = unshuffle(inside).mean(2, keepdims=True)
-        fine = np.concatenate([enlarged, moved_pixels, share, beside], 2).astype(np.float32)
-        head = shuffle(conv3(silu(conv3(fine, self.tensors, "flow.fine")), self.tensors, "flow.head"))
+        fine = conv3(np.concatenate([enlarged, moved_pixels, share, beside], 2).astype(np.float32), self.tensors, "flow.fine")
+        if remembered is not None:
+            fine = fine + conv3(remembered, self.tensors, "flow.memory.fine")
+        head = shuffle(conv3(silu(fine), self.tensors, "flow.head"))
         values = [sample(last, room + 4 * head[..., 0:2]), sample(last, turned + 4 * head[..., 2:4]), content + head[..., 7]]
         lost = lambda places: np.minimum(2 * outside(places, self.shape), 8)
         logits = np.stack([head[..., 4] + 1.5 - lost(room), head[..., 5] - lost(turned), head[..., 6]], 2)
         shares = np.exp(logits - logits.max(2, keepdims=True))
         shares = shares / shares.sum(2, keepdims=True)
-        return (np.stack(values, 2) * shares).sum(2)
+        drawn = (np.stack(values, 2) * shares).sum(2)
+        if remembered is None:
+            return drawn
+        logits = shuffle(conv3(silu(fine), self.tensors, "flow.memory.share"))[..., 0]
+        return drawn + (shuffle(remembered[..., 8:])[..., 0] - drawn) / (1 + np.exp(3 - logits))
 
 
 class DepthNetwork(FlowNetwork):
@@ -510,19 +516,30 @@ class DepthNetwork(FlowNetwork):
             blocks.append(unshuffle(frame[..., None]))
             shifts.append(shift)
         x = np.concatenate(blocks + shifts + [self.place_values], 2).astype(np.float32)
-        first = silu(conv3(x, self.tensors, "flow.stem"))
+        seen = conv3(x, self.tensors, "flow.stem")
+        if self.spec["flow"].get("memory", False):
+            now = self.remembered(states[-1], np.zeros(3), mean, spread)
+            seen = seen + conv3(now[..., 8:], self.tensors, "flow.memory.seen")
+        first = silu(seen)
         coarse = self.encoded(first)
         enlarged = silu(shuffle(dense(silu(coarse), self.tensors, "flow.depth.enlarge")))
         logarithm = conv3(np.concatenate([enlarged, first], 2), self.tensors, "flow.depth.output")
         depth = self.first_depth * np.exp(1.5 * np.tanh(shuffle(logarithm)[..., 0]))
         motions = self.motions(states[-1], actions)
-        drawn = [
-            self.step_with_depth(step, frames[-1], coarse, depth, motions[step], (actions, states[-1]))
-            for step in range(len(motions))
-        ]
+        drawn = []
+        for step, motion in enumerate(motions):
+            remembered = self.remembered(states[-1], motion, mean, spread)
+            drawn.append(self.step_with_depth(step, frames[-1], coarse, depth, motion, (actions, states[-1]), remembered))
         return [np.clip(frame * spread + mean, 0, 1) for frame in drawn]
 
-    def step_with_depth(self, step, last, coarse, depth, motion, known):
+    def remembered(self, state, motion, mean, spread):
+        """The scene after a motion, its content counted as the frames are; None for a model without a memory."""
+        if not self.spec["flow"].get("memory", False):
+            return None
+        scene = self.scene(state, motion, moved(self.pose_in(state), motion))
+        return np.concatenate([scene[..., :8], (scene[..., 8:] - mean) / spread], 2).astype(np.float32)
+
+    def step_with_depth(self, step, last, coarse, depth, motion, known, remembered=None):
         """Where the camera saw each pixel before it moved: the depth that is found there corrects the guess."""
         directions, offset = rotated(self.viewer.rays(), motion[0]), np.array([motion[1], motion[2], 0])
         turned = self.viewer.project(directions)
@@ -541,7 +558,7 @@ class DepthNetwork(FlowNetwork):
         z = self.refined(dense(mixed, self.tensors, "flow.mix"), self.modulation(step, motion, *known))
         inverse, far = 1 / np.maximum(guess[::2, ::2], 0.05), np.minimum(outside(room[::2, ::2], self.shape) / 8, 4)
         beside = np.concatenate([self.place_values, inverse[..., None], far[..., None]], 2)
-        return self.drawn(z, last, beside, np.zeros(self.shape), room, turned)
+        return self.drawn(z, last, beside, np.zeros(self.shape), room, turned, remembered)
 
 
 # Files and the comparison.

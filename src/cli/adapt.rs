@@ -24,7 +24,8 @@ use foreframe_train::settings::SettingsLayer;
 #[command(after_help = "Examples:
   foreframe import ~/mycar/data --name mycar --every 4
   foreframe adapt mycar --mirror angle
-  foreframe adapt mycar --from rooms --name mycar-2 --steps 2000")]
+  foreframe adapt mycar --from rooms --name mycar-2 --steps 2000
+  foreframe adapt myroom --remember")]
 pub(super) struct AdaptArgs {
     /// The directory of a data set, or its name in `DATA_DIR/datasets`
     #[arg(value_name = "DATASET")]
@@ -42,6 +43,10 @@ pub(super) struct AdaptArgs {
     /// mirrored
     #[arg(long, value_name = "CHANNEL")]
     mirror: Vec<String>,
+    /// Also remember what the room of the recording looks like, for a robot that stays in it. Its states must have x, y, heading_cos
+    /// and heading_sin, always from the same origin
+    #[arg(long, conflicts_with = "mirror")]
+    remember: bool,
     /// Another setting of the training, as in data.brightness=0; may be repeated
     #[arg(long = "set", value_name = "KEY=VALUE")]
     settings: Vec<String>,
@@ -105,6 +110,7 @@ fn settings(args: &AdaptArgs, dataset: &str) -> Result<AdaptSettings, CliError> 
         name,
         steps: args.steps,
         mirror: args.mirror.clone(),
+        remember: args.remember,
         layers: layers.collect::<Result<_, _>>()?,
     })
 }

@@ -97,7 +97,7 @@ fn every_job_body_fits_exactly_one_variant_of_its_schema() {
             "camera_height": 0.2, "skip_bad": true}),
         json!({"kind": "train", "name": "a", "preset": "paper", "dataset": "d", "settings": {"sequence": {"steps": 1}},
             "after": "job-1"}),
-        json!({"kind": "adapt", "name": "a", "dataset": "d", "from": "rooms", "from_version": 1, "steps": 9, "mirror": ["angle"]}),
+        json!({"kind": "adapt", "name": "a", "dataset": "d", "from": "rooms", "from_version": 1, "steps": 9, "mirror": ["angle"], "remember": true}),
         json!({"kind": "evaluate", "model": "a", "dataset": "d", "version": 1, "windows": 10}),
     ];
     let mismatches: Vec<_> = valid

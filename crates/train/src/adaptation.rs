@@ -30,6 +30,8 @@ pub struct AdaptSettings {
     pub steps: u32,
     /// Channels whose sign changes in a mirror, such as a steering angle. If there are any, half of the training windows are mirrored.
     pub mirror: Vec<String>,
+    /// Whether the model also learns to remember the one room of the recording, which it finds by the absolute pose in the state.
+    pub remember: bool,
     /// Further settings of the training.
     pub layers: Vec<SettingsLayer>,
 }
@@ -75,7 +77,14 @@ impl AdaptSettings {
                 channels => format!("data.mirror={channels:?}"),
             },
         ];
-        let own = settings.iter().map(|setting| SettingsLayer::assignment(setting));
+        // A mirrored room would be another one, and without its pose it could not be told.
+        let remembering: &[&str] = if self.remember {
+            &["model.flow.memory=true", "sequence.scene_weight=0.3", "data.hidden=0.0"]
+        } else {
+            &[]
+        };
+        let settings = settings.iter().map(String::as_str).chain(remembering.iter().copied());
+        let own = settings.map(SettingsLayer::assignment);
         let layers = own.chain(self.layers.iter().cloned().map(Ok));
         let layers = layers.collect::<Result<Vec<_>, _>>()?;
         let config = TrainConfig::of_model(base, layers)?;

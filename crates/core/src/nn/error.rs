@@ -70,6 +70,12 @@ pub enum NnError {
     /// Only the depth form sees how fast the camera drives.
     #[error("model specification: flow.speeds is true, but flow.depth is false; only the depth form estimates speeds")]
     SpeedsDepth,
+    /// A memory of a room lacks something.
+    #[error(
+        "model specification: flow.memory is true; it needs flow.depth, actions, a camera model, and a state with x, y, heading_cos \
+         and heading_sin"
+    )]
+    Memory,
     /// Two forms of the flow network at once.
     #[error("model specification: flow.recurrent and flow.depth are both true; a network has one of these forms")]
     RecurrentDepth,

@@ -9,11 +9,11 @@
 //! Sizes beside those of [`crate::nn`]: M items (N rollouts of K steps each, step after step), C channels on the grid of a
 //! quarter of the frame's sides.
 //!
-//! The form with `depth` remembers nothing: it estimates how deep the last frame is, and `reprojection` says where the moved
-//! camera saw each of its pixels.
+//! The form with `depth` estimates how deep the last frame is, and `reprojection` says where the moved camera saw each of its pixels. It
+//! remembers nothing, unless it has a `memory` of one room.
 //!
 //! Reading order: `room_geometry` → `encoder_views` and `rollout_rows` (what the network reads) → `scene` and `motion`, or
-//! `depth_views`, `reprojection`, `depth_head`, `speed_head`, `mover_head` and `occupancy` → `layers` (its tensors) → `network` →
+//! `depth_views`, `reprojection`, `depth_head`, `speed_head`, `mover_head`, `memory` and `occupancy` → `layers` (its tensors) → `network` →
 //! `direct`, `recurrent` and `depth` (its three forms) → `predict` → `beyond_horizon`. `plain` has the same in candle's own tensor
 //! operations.
 
@@ -25,6 +25,7 @@ mod depth_views;
 mod direct;
 mod encoder_views;
 mod layers;
+mod memory;
 mod motion;
 mod mover_head;
 mod network;

@@ -311,6 +311,43 @@ fn half_told(spec: &ModelSpec) -> ConditioningTensors {
 }
 
 #[test]
+fn the_form_that_remembers_a_room_agrees() {
+    let layers = FlowLayers {
+        depth: true,
+        speeds: true,
+        memory: true,
+        ..FlowLayers::default()
+    };
+    assert_flow_agrees(layers, Some(camera()), Conditioning::StateAction);
+    let spec = spec(flow(layers, Some(camera())), Conditioning::StateAction);
+    let parameters = parameters(&spec);
+    let predict = |network: &Network, conditioning: &ConditioningTensors| {
+        let predicted = network.predict_flow(&frames(spec.context), conditioning, spec.horizon);
+        predicted.unwrap().unwrap().frames
+    };
+    let networks = [
+        Network::detached(spec.clone(), &parameters).unwrap(),
+        Network::plain(spec.clone(), &parameters, &[""]).unwrap(),
+    ];
+    // Where the pose is not known, the memory counts for nothing: not even what is wrong in it.
+    let half = half_told(&spec);
+    let [fused, plain] = networks.each_ref().map(|network| predict(network, &half));
+    assert!(largest_difference(&fused, &plain) < 1e-5);
+    let forgotten = parameters.snapshot().unwrap().into_iter().map(|(name, tensor)| {
+        let is_memory = name.starts_with("flow.scene.");
+        let tensor = if is_memory { (tensor * 3.0).unwrap() } else { tensor };
+        (name, tensor)
+    });
+    let forgotten = Parameters::from_tensors(&spec, forgotten.collect()).unwrap();
+    let other = predict(&Network::detached(spec.clone(), &forgotten).unwrap(), &half);
+    let window = |frames: &Tensor, window: usize| frames.get(window).unwrap();
+    for untold in [0, 1] {
+        assert!(largest_difference(&window(&fused, untold), &window(&other, untold)) < 1e-7);
+    }
+    assert!(largest_difference(&window(&fused, 2), &window(&other, 2)) > 1e-4);
+}
+
+#[test]
 fn the_form_that_sees_speeds_agrees() {
     let layers = FlowLayers {
         depth: true,

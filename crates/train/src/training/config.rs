@@ -270,11 +270,16 @@ impl TrainConfig {
         matches!(self.model.architecture, ArchitectureConfig::Flow(layers) if layers.speeds)
     }
 
+    /// Whether the network remembers one room.
+    pub(super) fn remembers_room(&self) -> bool {
+        matches!(self.model.architecture, ArchitectureConfig::Flow(layers) if layers.memory)
+    }
+
     /// What becomes of channels and masks that one of several data sets lacks.
     #[doc(hidden)]
     #[must_use]
     pub fn lacking(&self) -> Lacking {
-        if self.sees_speeds() {
+        if self.sees_speeds() && !self.remembers_room() {
             Lacking::NotKnown
         } else {
             Lacking::Refused

@@ -12,9 +12,15 @@ use foreframe_core::registry::StoredWeights;
 use foreframe_core::types::Seed;
 
 /// Prefixes of the names of tensors that a network may have and the one before it not.
-const OPTIONAL_PREFIXES: [&str; 3] = ["flow.movers.", "flow.speeds.", "flow.motion."];
+const OPTIONAL_PREFIXES: [&str; 5] = [
+    "flow.movers.",
+    "flow.speeds.",
+    "flow.motion.",
+    "flow.memory.",
+    "flow.scene.",
+];
 
-/// The weights of another model. What only this training's network has, of movers, speeds and motion, starts at random, and what
+/// The weights of another model. What only this training's network has, of movers, speeds, motion and memory, starts at random, and what
 /// only the other one has of them is left out. If this network sees how fast the camera drives, states and actions may be others
 /// too: the weights of those that both have stay, and those of new ones start at 0.
 /// Errors: `OtherNetwork` if they do not fit this training's network, `OtherUnits`.

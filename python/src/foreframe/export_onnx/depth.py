@@ -13,7 +13,7 @@ from .inputs import Inputs
 from .layers import block_mean, limited, shuffle, silu, unshuffle
 from .model_directory import ModelDirectory
 from .motion import Motion, speed_channels
-from .scene import pose_channels, pose_in
+from .scene import Room, pose_channels, pose_in
 
 _WALL_M, _FARTHER, _LEAST_SPREAD = 2.2, 1.25, 0.04
 _DEPTH_ROUNDS = 3
@@ -48,6 +48,13 @@ class _View(NamedTuple):
     block_values: Tensor
 
 
+class _Levels(NamedTuple):
+    """Mean and standard deviation of the last frames ``[rows, 1, 1, 1]``."""
+
+    mean: Tensor
+    spread: Tensor
+
+
 class DepthNetwork(FlowLayers):
     """Frames are normalized with the last frame's mean and standard deviation."""
 
@@ -55,6 +62,8 @@ class DepthNetwork(FlowLayers):
         super().__init__(model)
         self.pose_channels = pose_channels(self.states)
         self.read_states = [channel for channel in self.read_states if channel not in (self.pose_channels or [])]
+        remembers = self.pose_channels and self.sizes.get("memory", False)
+        self.room = Room(self.spec, self.layers, self.pose_channels) if remembers and self.pose_channels else None
 
     def add_window(self, graph: Graph) -> None:
         """All frames of the context in; the predicted frames, the last one's depth and the movers out."""
@@ -63,13 +72,15 @@ class DepthNetwork(FlowLayers):
         camera = _Camera(*(given[:, part : part + 1].reshape(-1, 1, 1, 1) for part in range(3)))
         level = mean(frames[0], [1, 2, 3])
         spread = np.maximum(np.sqrt(mean((frames[0] - level) * (frames[0] - level), [1, 2, 3])), _LEAST_SPREAD)
-        view = self._view([(frame - level) / spread for frame in frames], camera, inputs)
+        levels = _Levels(level, spread)
+        view = self._view([(frame - level) / spread for frame in frames], camera, inputs, levels)
         state = self.scaled_state(inputs.state)
         actions = None if inputs.actions is None else limited(inputs.actions, self.spec["actions"])
         motion = None if actions is None else Motion(self.spec, self.layers)(actions, inputs.state, state)
         modulation = self.modulation(range(self.horizon), state, actions, motion, view.frame)
         moved = for_each_row(np.zeros((1, self.horizon, 3)), view.frame) if motion is None else motion
-        drawn, z = self._steps(view, moved.reshape(-1, 3, 1, 1), modulation)
+        remembered = self._remembered_ahead(inputs, moved.reshape(-1, 3, 1, 1), levels)
+        drawn, z = self._steps(view, moved.reshape(-1, 3, 1, 1), modulation, remembered)
         drawn = drawn.reshape(-1, self.horizon, *self.shape)
         self.frames_output(graph, clip(drawn * spread + level, 0, 1))
         graph.output("depth", view.depth.reshape(-1, *self.shape), ["batch", *self.shape], "of the last frame, in metres")
@@ -79,7 +90,7 @@ class DepthNetwork(FlowLayers):
             about = "in the last frame and the next ones, logits: above 0 a pixel is more likely a mover's than not"
             graph.output("movers", movers, ["batch", 1 + self.horizon, *self.shape], about)
 
-    def _view(self, frames: list[Tensor], camera: _Camera, inputs: Inputs) -> _View:
+    def _view(self, frames: list[Tensor], camera: _Camera, inputs: Inputs, levels: _Levels) -> _View:
         """The last frame, encoded with its depth from how the earlier ones differ."""
         viewer = camera.viewer(self.shape)
         first_depth = camera.first_depth(viewer)
@@ -90,11 +101,27 @@ class DepthNetwork(FlowLayers):
             is_inside = places.is_near(self.shape, -0.5, -0.5)
             blocks.append(unshuffle(where(is_inside, sample(earlier, places, self.shape), frames[0])))
             shifts += shift
-        first = silu(self.layers.conv3(concat([*blocks, *shifts, block_values]), "flow.stem"))
+        seen = self.layers.conv3(concat([*blocks, *shifts, block_values]), "flow.stem")
+        if self.room and inputs.state is not None:
+            now = self._counted(self.room.scene(self.room.pose_in(inputs.state)), levels)
+            seen = seen + self.layers.conv3(now[:, 8:], "flow.memory.seen")
+        first = silu(seen)
         coarse = self.encoded(first)
         enlarged = silu(shuffle(self.layers.at_each_place(silu(coarse), "flow.depth.enlarge")))
         logarithm = shuffle(self.layers.conv3(concat([enlarged, first]), "flow.depth.output"))
         return _View(camera, frames[0], coarse, first_depth * np.exp(1.5 * np.tanh(logarithm)), block_values)
+
+    def _counted(self, scene: Value, levels: _Levels) -> Tensor:
+        """Features of the scene, then its content counted as the frames are."""
+        return concat([scene[:, :8], (scene[:, 8:] - levels.mean) / levels.spread])
+
+    def _remembered_ahead(self, inputs: Inputs, motion: Tensor, levels: _Levels) -> Value:
+        """What is remembered of the room at each step; None for a model without a memory."""
+        if not self.room or inputs.state is None:
+            return None
+        before = self.room.pose_in(inputs.state).each(self.for_each_step)
+        pose = before.moved(*(motion[:, part : part + 1] for part in range(3)))
+        return self._counted(self.room.scene(pose), _Levels(*(self.for_each_step(level, 1, 1, 1) for level in levels)))
 
     def _motion_back(self, inputs: Inputs, back: int) -> tuple[Turn, Value, Value]:
         """Where the camera stood at an earlier frame, as seen from the last one: turn, ahead, left."""
@@ -120,7 +147,7 @@ class DepthNetwork(FlowLayers):
         # The sum of the four pixels of a block.
         return near, [4 * block_mean(clip((b - a) / 4, -4, 4) / 4) for a, b in zip(near, far)]
 
-    def _steps(self, view: _View, motion: Tensor, modulation: Tensor) -> tuple[Tensor, Tensor]:
+    def _steps(self, view: _View, motion: Tensor, modulation: Tensor, remembered: Value) -> tuple[Tensor, Tensor]:
         """The frames of all steps at once, and their states. Each window has a row for each step."""
         rows = self.for_each_step
         viewer = _Camera(*(rows(number, 1, 1, 1) for number in view.camera)).viewer(self.shape)
@@ -142,7 +169,7 @@ class DepthNetwork(FlowLayers):
         upper_left = Place(*(at[:, :, ::2, ::2] for at in room))
         far = np.minimum(upper_left.outside(self.shape) / 8, 4)
         beside = concat([block_values, 1 / np.maximum(guess[:, :, ::2, ::2], 0.05), far])
-        return self.drawn(z, last, beside, 0.0, room, turned), z
+        return self.drawn(z, last, beside, 0.0, room, turned, remembered), z
 
     def _movers(self, z: Tensor, name: str) -> Tensor:
         return shuffle(shuffle(self.layers.at_each_place(silu(z), "flow.movers." + name)))

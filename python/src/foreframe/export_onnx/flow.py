@@ -90,12 +90,17 @@ class FlowLayers:
             z = z + inner
         return z
 
-    def drawn(self, z: Tensor, last: Tensor, beside: Tensor, content: Value, room: Place, turned: Place) -> Tensor:
-        """The frame of a state: pixels of the last frame, moved in two ways, and content, mixed."""
+    def drawn(
+        self, z: Tensor, last: Tensor, beside: Tensor, content: Value, room: Place, turned: Place, remembered: Value = None
+    ) -> Tensor:
+        """The frame of a state: pixels of the last frame, moved in two ways, and content, mixed; and then with what is remembered."""
         layers, moved = self.layers, self.sampled(last, room)
         enlarged = shuffle(layers.at_each_place(silu(z), "flow.enlarge"))
         share = block_mean(inside(room.outside(self.shape), last))
-        fine = silu(layers.conv3(concat([enlarged, unshuffle(moved), share, beside]), "flow.fine"))
+        fine = layers.conv3(concat([enlarged, unshuffle(moved), share, beside]), "flow.fine")
+        if remembered is not None:
+            fine = fine + layers.conv3(remembered, "flow.memory.fine")
+        fine = silu(fine)
         head = shuffle(layers.conv3(fine, "flow.head"))
         part = [head[:, index : index + 1] for index in range(8)]
         values = [
@@ -105,7 +110,11 @@ class FlowLayers:
         ]
         lost = [np.minimum(2 * place.outside(self.shape), 8) for place in (room, turned)]
         logits = concat([part[4] + 1.5 - lost[0], part[5] - lost[1], part[6]])
-        return total(concat(values) * logits.graph.node("Softmax", logits, axis=1), 1)
+        drawn = total(concat(values) * logits.graph.node("Softmax", logits, axis=1), 1)
+        if remembered is None:
+            return drawn
+        share = shuffle(layers.conv3(fine, "flow.memory.share"))
+        return drawn + (shuffle(remembered[:, 8:]) - drawn) / (1 + np.exp(3 - share))
 
     def sampled(self, image: Tensor, place: Place) -> Tensor:
         """The image at places. Those that are constant are the pixels' own."""

@@ -142,9 +142,14 @@ impl FlowNetwork {
 
     /// Encodes the contexts of the rollouts and estimates their depths.
     pub(super) fn see_depth(&self, rows: &RolloutRows, head: &DepthHead) -> Result<SeenDepths, NnError> {
-        let contexts = rows.contexts(self.sizes.layers.frames_read);
+        let mut contexts = rows.contexts(self.sizes.layers.frames_read);
         let mut views = DepthViews::of(&contexts);
-        let features = self.encode(contexts.count(), std::mem::take(&mut views.inputs))?;
+        let memory = self.memory.as_ref();
+        let remembered = memory
+            .map(|memory| memory.now(&mut contexts, &views.levels))
+            .transpose()?;
+        let inputs = std::mem::take(&mut views.inputs);
+        let features = self.encode(contexts.count(), inputs, remembered.as_ref())?;
         let depths = head.forward(&features, &views)?;
         let [coarse, _] = features;
         let movers = self.movers.as_ref().map(|movers| movers.seen(&coarse)).transpose()?;
@@ -195,7 +200,19 @@ impl FlowNetwork {
         } = self.see_ahead(ahead, depths)?;
         let movers = self.movers.as_ref().map(|movers| movers.coming(&state)).transpose()?;
         let moved = sampled_blocks(&views.frames, &context_of, &seen.room, size)?;
-        let head = self.head(&state, &moved, &seen.beside_pixels(views, &context_of, size)?)?;
+        let levels: Vec<[f32; 2]> = context_of
+            .iter()
+            .map(|&context| views.levels[context as usize])
+            .collect();
+        let memory = self.memory.as_ref();
+        let recalled = memory.map(|memory| memory.recall(ahead, &levels)).transpose()?;
+        let beside = seen.beside_pixels(views, &context_of, size)?;
+        let fine = self.fine(
+            &state,
+            [&moved, &beside],
+            recalled.as_ref().map(|recalled| &recalled.fine),
+        )?;
+        let head = self.head(&fine)?;
 
         let half = size.shrunk(2);
         let no_content = Tensor::zeros((context_of.len(), half.height, half.width, 4), DType::F32, &Device::Cpu)?;
@@ -205,18 +222,20 @@ impl FlowNetwork {
             frame_of: context_of.clone(),
             room: RoomPlaces::Tracked,
         };
-        let frames = composition.compose(&head, &no_content, &places)?;
+        let mut frames = composition.compose(&head, &no_content, &places)?;
+        if let (Some(memory), Some(recalled)) = (memory, &recalled) {
+            frames = memory.mix(&frames, &fine, recalled)?;
+        }
         let level = |part: usize| -> Result<Tensor, NnError> {
-            let levels: Vec<f32> = context_of
-                .iter()
-                .map(|&context| views.levels[context as usize][part])
-                .collect();
+            let levels: Vec<f32> = levels.iter().map(|levels| levels[part]).collect();
             Ok(Tensor::from_vec(levels, (context_of.len(), 1), &Device::Cpu)?)
         };
         let frames = frames.broadcast_mul(&level(1)?)?.broadcast_add(&level(0)?)?;
         Ok(PredictedAhead {
             frames: frames.reshape(shape)?,
-            scene: None,
+            scene: recalled
+                .map(|recalled| recalled.intensities.reshape(shape))
+                .transpose()?,
             movers: movers.map(|movers| movers.reshape(shape)).transpose()?,
         })
     }

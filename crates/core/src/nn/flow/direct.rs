@@ -28,7 +28,7 @@ impl FlowNetwork {
     pub(super) fn see(&self, rows: &RolloutRows, scene: &Scene) -> Result<SeenContexts, NnError> {
         let contexts = rows.contexts(self.sizes.layers.frames_read);
         let inputs = contexts.inputs(self.sizes.camera, &scene.content_now(&contexts)?);
-        let [coarse, _] = self.encode(contexts.count(), inputs)?;
+        let [coarse, _] = self.encode(contexts.count(), inputs, None)?;
         Ok(SeenContexts {
             coarse,
             last_frames: contexts.last_frames,
@@ -58,7 +58,7 @@ impl FlowNetwork {
         let features = scene.narrow(3, 0, SCENE_FEATURES)?;
         let mixed = Tensor::cat(&[&warped, &pixel_unshuffle(&features)?], 3)?;
         let state = self.refined(per_place(&self.mix, &mixed)?, &ahead.modulation()?)?;
-        let head = self.head(&state, &moved, &scene)?;
+        let head = self.head(&self.fine(&state, [&moved, &scene], None)?)?;
 
         let composition = Composition {
             size,

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use super::blocks::MOVED_CHANNELS;
+use super::blocks::{BLOCK_PIXELS, MOVED_CHANNELS};
 use super::depth_head::{FINE_VALUES, MIXED_VALUES};
 use super::depth_views::DepthViews;
 use super::encoder_views::EncoderViews;
@@ -42,7 +42,7 @@ pub(in crate::nn) fn tensor_shapes(spec: &ModelSpec, flow: &FlowSpec) -> BTreeMa
         SceneKind::Room(..) => vec![6],
         _ => vec![spec.image_size().shrunk(2).pixels(), SCENE_CHANNELS],
     };
-    if !flow.layers.depth {
+    if !flow.layers.depth || flow.layers.memory {
         shapes.insert(scene.tensor_name().to_owned(), shape);
     }
     shapes
@@ -146,7 +146,8 @@ fn layer_sizes(spec: &ModelSpec, flow: &FlowSpec) -> Vec<LayerSize> {
     layer("modulation.inputs", told, MODULATION_HIDDEN, horizon);
     let modulated = (2 * sizes.decoder_blocks).max(1) * 2 * channels;
     layer("modulation.output", MODULATION_HIDDEN, modulated, horizon);
-    let scene = SceneKind::of(spec, flow.camera).inputs(spec).filter(|_| !sizes.depth);
+    let scene = SceneKind::of(spec, flow.camera).inputs(spec);
+    let scene = scene.filter(|_| !sizes.depth || sizes.memory);
     if let Some(inputs) = scene {
         // Once for each predicted frame, and once for the last frame seen.
         let rows = (horizon + 1) * half;
@@ -177,7 +178,7 @@ fn layer_sizes(spec: &ModelSpec, flow: &FlowSpec) -> Vec<LayerSize> {
     layers
 }
 
-/// The layers that see depth, movers and speeds: name, inputs, outputs and rows of each, on the grids of half and of a quarter of the
+/// The layers that see depth, movers and speeds, and those that read the memory: name, inputs, outputs and rows of each, on the grids of half and of a quarter of the
 /// sides.
 fn seeing_layers(
     sizes: &FlowLayers,
@@ -193,6 +194,12 @@ fn seeing_layers(
     if sizes.movers {
         layers.push(("movers.seen", channels, FRAME_CHANNELS, quarter));
         layers.push(("movers.coming", channels, FRAME_CHANNELS, horizon * quarter));
+    }
+    if sizes.memory {
+        let fine = sizes.fine_channels;
+        layers.push(("memory.seen", TAPS * BLOCK_PIXELS, sizes.stem_channels, half));
+        layers.push(("memory.fine", TAPS * SCENE_CHANNELS, fine, horizon * half));
+        layers.push(("memory.share", TAPS * fine, BLOCK_PIXELS, horizon * half));
     }
     if sizes.speeds {
         let read = TAPS * speed_channels(sizes.frames_read);

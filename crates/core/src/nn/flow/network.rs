@@ -4,6 +4,7 @@ use candle_core::{Device, Tensor};
 
 use super::depth_head::DepthHead;
 use super::layers::mix_name;
+use super::memory::Memory;
 use super::motion::MotionHead;
 use super::mover_head::MoverHead;
 use super::rollout_rows::RolloutRows;
@@ -60,6 +61,7 @@ pub(in crate::nn) struct FlowNetwork {
     pub(super) motion: MotionHead,
     pub(super) movers: Option<MoverHead>,
     pub(super) speeds: Option<SpeedHead>,
+    pub(super) memory: Option<Memory>,
     pub(super) modulation: [Linear; 2],
     pub(super) mix: Linear,
     pub(super) refine: Vec<[Convolution3; 2]>,
@@ -94,6 +96,7 @@ impl FlowNetwork {
             motion: MotionHead::new(&spec, &sizes, tensors),
             movers: layers.movers.then(|| MoverHead::new(tensors)),
             speeds: layers.speeds.then(|| SpeedHead::new(tensors)),
+            memory: Memory::of(&spec, tensors),
             modulation: ["inputs", "output"].map(|part| tensors.linear(&format!("flow.modulation.{part}"))),
             mix: tensors.linear(&format!("flow.{}", mix_name(layers))),
             refine: (0..layers.decoder_blocks)
@@ -131,6 +134,9 @@ impl FlowNetwork {
         }
         if let Some(speeds) = &mut self.speeds {
             speeds.pack()?;
+        }
+        if let Some(memory) = &mut self.memory {
+            memory.pack()?;
         }
         match &mut self.surroundings {
             Surroundings::Remembered(scene) => scene.pack(),
@@ -171,20 +177,35 @@ impl FlowNetwork {
         Ok(state)
     }
 
-    /// The head's values of each item `[M, H/2, W/2, 4 · HEAD_VALUES]` from its state, the pixels to move and the scene.
-    pub(super) fn head(&self, state: &Tensor, moved: &Tensor, scene: &Tensor) -> Result<Tensor, NnError> {
+    /// The fine layer's values of each item `[M, H/2, W/2, …]` from its state, the pixels to move and what is known beside them, plus
+    /// `added`.
+    pub(super) fn fine(
+        &self,
+        state: &Tensor,
+        [moved, beside]: [&Tensor; 2],
+        added: Option<&Tensor>,
+    ) -> Result<Tensor, NnError> {
         let enlarged = pixel_shuffle(&per_place(&self.enlarge, &silu(state)?)?)?;
-        let inputs = Tensor::cat(&[&enlarged, moved, scene], 3)?;
-        let fine = activated_convolution(&self.fine, &inputs, Activation::None, None)?;
-        Ok(activated_convolution(&self.head, &fine, Activation::Silu, None)?)
+        let inputs = Tensor::cat(&[&enlarged, moved, beside], 3)?;
+        Ok(activated_convolution(&self.fine, &inputs, Activation::None, added)?)
+    }
+
+    /// The head's values `[M, H/2, W/2, 4 · HEAD_VALUES]` from those of the fine layer.
+    pub(super) fn head(&self, fine: &Tensor) -> Result<Tensor, NnError> {
+        Ok(activated_convolution(&self.head, fine, Activation::Silu, None)?)
     }
 
     /// Features of each context `[contexts, H/4, W/4, C]` and those of the first layer `[contexts, H/2, W/2, …]`, from the
-    /// encoder's inputs `[contexts, H/2 · W/2 · …]`.
-    pub(super) fn encode(&self, contexts: usize, inputs: Vec<f32>) -> Result<[Tensor; 2], NnError> {
+    /// encoder's inputs `[contexts, H/2 · W/2 · …]`. The first layer adds `added`.
+    pub(super) fn encode(
+        &self,
+        contexts: usize,
+        inputs: Vec<f32>,
+        added: Option<&Tensor>,
+    ) -> Result<[Tensor; 2], NnError> {
         let half = self.spec.image_size().shrunk(2);
         let inputs = Tensor::from_vec(inputs, (contexts, half.height, half.width, ()), &Device::Cpu)?;
-        let first = silu(&activated_convolution(&self.stem, &inputs, Activation::None, None)?)?;
+        let first = silu(&activated_convolution(&self.stem, &inputs, Activation::None, added)?)?;
         let mut coarse = activated_convolution(&self.halving, &first, Activation::None, None)?;
         for [first, second] in &self.blocks {
             let inner = activated_convolution(first, &coarse, Activation::Silu, None)?;

@@ -2,7 +2,7 @@
 //! cards. All steps of all rollouts are computed together. Small things stay on the CPU: the wheels' integral and where the state says
 //! that the camera stands.
 //!
-//! Reading order: `cameras` and `motion` → `composition` → `depth_views`, `reprojection` and `depth`, or `room`, `scene`, `direct` and
+//! Reading order: `cameras` and `motion` → `composition` → `depth_views`, `reprojection`, `memory` and `depth`, or `room`, `scene`, `direct` and
 //! `recurrent`.
 
 mod cameras;
@@ -10,6 +10,7 @@ mod composition;
 mod depth;
 mod depth_views;
 mod direct;
+mod memory;
 mod motion;
 mod recurrent;
 mod reprojection;
@@ -116,9 +117,9 @@ impl FlowNetwork {
     }
 
     /// Features of each context `[contexts, C, H/4, W/4]` and those of the first layer `[contexts, …, H/2, W/2]`, from the encoder's
-    /// inputs `[contexts, …, H/2, W/2]`.
-    fn plain_encode(&self, inputs: &Tensor) -> Result<[Tensor; 2], NnError> {
-        let first = convolution(&self.stem, inputs)?.silu()?;
+    /// inputs `[contexts, …, H/2, W/2]`. The first layer adds `added`.
+    fn plain_encode(&self, inputs: &Tensor, added: Option<&Tensor>) -> Result<[Tensor; 2], NnError> {
+        let first = plus(convolution(&self.stem, inputs)?, added)?.silu()?;
         let mut coarse = convolution(&self.halving, &first)?;
         for [before, after] in &self.blocks {
             let inner = convolution(before, &coarse.silu()?)?;
@@ -143,11 +144,28 @@ impl FlowNetwork {
         Ok(state)
     }
 
-    /// The head's values of each pixel `[M, HEAD_VALUES, P]` from the items' states and what else the fine layers read.
-    fn plain_head(&self, state: &Tensor, moved: &Tensor, beside: &Tensor) -> Result<Tensor, NnError> {
+    /// The fine layer's values `[M, …, H/2, W/2]` from the items' states and what else it reads, plus `added`.
+    fn plain_fine(
+        &self,
+        state: &Tensor,
+        [moved, beside]: [&Tensor; 2],
+        added: Option<&Tensor>,
+    ) -> Result<Tensor, NnError> {
         let enlarged = pixel_shuffle(&linear_per_place(&self.enlarge, &state.silu()?)?)?;
         let fine = convolution(&self.fine, &Tensor::cat(&[&enlarged, moved, beside], 1)?)?;
+        Ok(plus(fine, added)?)
+    }
+
+    /// The head's values of each pixel `[M, HEAD_VALUES, P]` from those of the fine layer.
+    fn plain_head(&self, fine: &Tensor) -> Result<Tensor, NnError> {
         Ok(pixel_shuffle(&convolution(&self.head, &fine.silu()?)?)?.flatten_from(2)?)
+    }
+}
+
+fn plus(values: Tensor, added: Option<&Tensor>) -> candle_core::Result<Tensor> {
+    match added {
+        Some(added) => values + added,
+        None => Ok(values),
     }
 }
 

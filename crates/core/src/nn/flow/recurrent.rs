@@ -28,7 +28,7 @@ impl FlowNetwork {
         let motion = Tensor::zeros((count, horizon, 3), DType::F32, &Device::Cpu)?;
         let contexts = rows.contexts(self.sizes.layers.frames_read);
         let inputs = contexts.inputs(self.sizes.camera, &scene.content_now(&contexts)?);
-        let [coarse, _] = self.encode(contexts.count(), inputs)?;
+        let [coarse, _] = self.encode(contexts.count(), inputs, None)?;
         let own_coarse = own_places(size.shrunk(4)).repeat(count);
         let context_of = rows.context_of();
         let mut state = sample_features(&coarse, own_coarse, &context_of)?;
@@ -56,7 +56,7 @@ impl FlowNetwork {
             let inputs = Tensor::cat(&[&state, &features, &seen], 3)?;
             state = (state + per_place(&self.mix, &inputs)?)?;
             state = self.refined(state, &modulation.narrow(1, step, 1)?.squeeze(1)?)?;
-            let head = self.head(&state, &moved, &scene)?;
+            let head = self.head(&self.fine(&state, [&moved, &scene], None)?)?;
             let composition = Composition {
                 size,
                 frames: last_frames,

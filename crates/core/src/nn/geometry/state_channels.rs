@@ -142,7 +142,9 @@ impl ModelSpec {
     /// the model takes no pose, or reads only how poses differ.
     pub(crate) fn absolute_pose(&self, state: &[f32]) -> Option<[f32; 3]> {
         let channels = StateChannels::of(self);
-        let [x, y, ..] = channels.pose.filter(|_| !self.reads_past_states())?;
+        let [x, y, ..] = channels
+            .pose
+            .filter(|_| self.remembers_room() || !self.reads_past_states())?;
         let scaled = |channel: usize| self.states[channel].scaled(state[channel]);
         (state.len() == self.states.len()).then(|| [scaled(x), scaled(y), channels.pose_in(state).heading])
     }
@@ -166,6 +168,20 @@ impl ModelSpec {
     #[must_use]
     pub fn sees_speeds(&self) -> bool {
         self.flow().is_some_and(|flow| flow.layers.speeds)
+    }
+
+    /// Whether the depth form remembers one room, which it finds by the absolute pose.
+    #[must_use]
+    pub fn remembers_room(&self) -> bool {
+        self.flow().is_some_and(|flow| flow.layers.memory)
+    }
+
+    /// Whether a memory of one room has what it needs: depth, actions, the camera and the absolute pose.
+    pub(in crate::nn) fn can_remember_a_room(&self) -> bool {
+        let sees = self
+            .flow()
+            .is_some_and(|flow| flow.layers.depth && flow.camera.is_some());
+        sees && self.action_inputs().is_some() && StateChannels::of(self).pose.is_some()
     }
 
     /// Whether a prediction uses the states at the context's earlier frames: it says from the poses how the camera has moved.

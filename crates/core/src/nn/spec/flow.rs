@@ -53,6 +53,9 @@ pub struct FlowLayers {
     /// Whether it also estimates from the frames how fast the camera drives and turns. This stands in for the states and actions that
     /// a robot does not tell. Only with `depth`.
     pub speeds: bool,
+    /// Whether it also remembers what one room looks like, and mixes that into what it sees, by the absolute pose in the state. Only
+    /// with `depth`, for a robot that lives in one room.
+    pub memory: bool,
     /// Whether each step continues from the state and the frame of the step before it, instead of starting from the last
     /// true frame. Only for models that take no actions.
     pub recurrent: bool,
@@ -72,6 +75,7 @@ impl Default for FlowLayers {
             depth: false,
             movers: false,
             speeds: false,
+            memory: false,
             recurrent: false,
         }
     }

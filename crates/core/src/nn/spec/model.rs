@@ -172,7 +172,13 @@ impl ModelSpec {
         self.check_channels()?;
         match &self.architecture {
             Architecture::Dense(_) => Ok(()),
-            Architecture::Flow(flow) => flow.check(self.conditioning, [self.frame_width_px, self.frame_height_px]),
+            Architecture::Flow(flow) => {
+                flow.check(self.conditioning, [self.frame_width_px, self.frame_height_px])?;
+                if flow.layers.memory && !self.can_remember_a_room() {
+                    return Err(NnError::Memory);
+                }
+                Ok(())
+            }
         }
     }
 

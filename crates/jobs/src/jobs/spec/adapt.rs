@@ -42,6 +42,10 @@ pub struct AdaptSpec {
     /// mirrored.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub mirror: Vec<String>,
+    /// Whether it also remembers what the room of the recording looks like, for a robot that stays in it. The states must have x, y,
+    /// heading_cos and heading_sin, always from the same origin, and `mirror` must be empty.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub remember: bool,
     /// Other settings of the training.
     #[serde(default, skip_serializing_if = "serde_json::Map::is_empty")]
     #[schema(value_type = Object)]
@@ -82,6 +86,7 @@ impl AdaptSpec {
             name: self.name.clone(),
             steps: self.steps,
             mirror: self.mirror.clone(),
+            remember: self.remember,
             layers: vec![layer],
         })
     }

@@ -124,6 +124,13 @@ impl TrainConfig {
                 self.data.hidden
             ));
         }
+        if self.remembers_room() && (self.data.hidden > 0.0 || self.data.mirror != Mirror::Off) {
+            return refused(format!(
+                "model.flow.memory is true, but a mirrored room is another room, and without the pose the room cannot be remembered; \
+                 set data.mirror to off and data.hidden to 0 ({} now)",
+                self.data.hidden
+            ));
+        }
         if sequence.short_share > 0.0 && !(1..=self.model.horizon).contains(&sequence.short_horizon) {
             return refused(format!(
                 "sequence.short_horizon is {}; it must be 1 to model.horizon, {}",

@@ -48,14 +48,25 @@ impl FlowNetwork {
         let last = ahead.of_contexts(&views.frames)?;
         let moved = moved_blocks(&last, size, &seen.places.room)?;
         let beside = beside_pixels(&steps.known, seen, size)?;
-        let head = self.plain_head(&steps.state, &moved, &beside)?;
-        let frames = seen.places.compose(&last, size, &head, &last.zeros_like()?)?;
+        let memory = self.memory.as_ref();
+        let recalled = memory
+            .map(|memory| memory.plain_recall(rows, ahead, views))
+            .transpose()?;
+        let added = recalled.as_ref().map(|recalled| &recalled.fine);
+        let fine = self.plain_fine(&steps.state, [&moved, &beside], added)?;
+        let head = self.plain_head(&fine)?;
+        let mut frames = seen.places.compose(&last, size, &head, &last.zeros_like()?)?;
+        if let (Some(memory), Some(recalled)) = (memory, &recalled) {
+            frames = memory.plain_mix(&frames, &fine, recalled)?;
+        }
         let frames = frames
             .broadcast_mul(&ahead.of_contexts(&views.spread)?)?
             .broadcast_add(&ahead.of_contexts(&views.mean)?)?;
         Ok(FlowPrediction {
             frames: ahead.in_rows(&frames)?,
-            scene: None,
+            scene: recalled
+                .map(|recalled| ahead.in_rows(&recalled.intensities))
+                .transpose()?,
             movers: self.plain_movers(&steps)?,
             speeds: rows.seen_speeds().map(|seen| seen.tensor.clone()),
             motion: steps.ahead.motion,
@@ -88,7 +99,9 @@ impl FlowNetwork {
         let size = self.spec.image_size();
         let contexts = rows.contexts(self.sizes.layers.frames_read);
         let views = SeenViews::of(&contexts, self.device())?;
-        let features = self.plain_encode(&views.inputs)?;
+        let memory = self.memory.as_ref();
+        let remembered = memory.map(|memory| memory.plain_now(&contexts, &views)).transpose()?;
+        let features = self.plain_encode(&views.inputs, remembered.as_ref())?;
         let depths = (head.depth_factors(&features)? * &views.depths)?;
         let [coarse, _] = features;
         let ahead = self.ahead(rows, steps)?;

@@ -29,7 +29,7 @@ impl FlowNetwork {
         let size = self.spec.image_size();
         let contexts = rows.contexts(self.sizes.layers.frames_read);
         let last = self.last_frames(&contexts)?;
-        let [coarse, _] = self.plain_encode(&self.encoder_inputs(&contexts, &last, scene)?)?;
+        let [coarse, _] = self.plain_encode(&self.encoder_inputs(&contexts, &last, scene)?, None)?;
         // The scene's own loss is of all steps.
         let computed = if self.is_trained() { self.spec.horizon } else { steps };
         let ahead = self.ahead(rows, computed)?;
@@ -51,7 +51,7 @@ impl FlowNetwork {
         let state = self.plain_state(&Tensor::cat(&[&warped, &features], 1)?, &ahead.modulation)?;
         let last = ahead.of_contexts(&last)?;
         let moved = moved_blocks(&last, size, &places.room)?;
-        let head = self.plain_head(&state, &moved, &seen)?;
+        let head = self.plain_head(&self.plain_fine(&state, [&moved, &seen], None)?)?;
         let content = pixel_shuffle(&content(&seen)?)?.flatten_from(1)?;
         let frames = places.compose(&last, size, &head, &content)?;
         Ok(FlowPrediction {

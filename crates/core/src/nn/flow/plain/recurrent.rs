@@ -24,7 +24,7 @@ impl FlowNetwork {
         let (count, horizon, size) = (rows.count(), self.spec.horizon, self.spec.image_size());
         let contexts = rows.contexts(self.sizes.layers.frames_read);
         let last = self.last_frames(&contexts)?;
-        let [coarse, _] = self.plain_encode(&self.encoder_inputs(&contexts, &last, scene)?)?;
+        let [coarse, _] = self.plain_encode(&self.encoder_inputs(&contexts, &last, scene)?, None)?;
         let once = self.ahead(rows, 1)?;
         let modulation = self.plain_modulate(rows, &once.motion)?;
         let views = SceneItems {
@@ -48,7 +48,7 @@ impl FlowNetwork {
             let inputs = Tensor::cat(&[&state, &features, &shown], 1)?;
             state = (state + linear_per_place(&self.mix, &inputs)?)?;
             state = self.plain_refined(state, &modulation.narrow(1, step, 1)?.squeeze(1)?)?;
-            let head = self.plain_head(&state, &moved, &seen)?;
+            let head = self.plain_head(&self.plain_fine(&state, [&moved, &seen], None)?)?;
             let frame = places.compose(&last, size, &head, &content)?;
             // Intensities end at black and white; what is beyond would grow from step to step.
             last = frame.detach().clamp(0f32, 1f32)?;
