@@ -190,27 +190,6 @@ def test_the_recurrent_form_is_as_by_numpy(drive: Drive, tmp_path: Path) -> None
     assert np.abs(ByOnnx(tmp_path)(window)["predicted"][0] - by_numpy.predict(window)).max() < TOLERANCE
 
 
-def test_the_memory_of_a_room_is_as_by_numpy(drive: Drive, tmp_path: Path) -> None:
-    """No shipped model has one: the weights of `rooms`, the scene of `moving-flow`, and random ones for what reads it."""
-    networks = numpy_networks()
-    manifest, tensors = networks.read_model(MODELS / "rooms")
-    home, scene = networks.read_model(MODELS / "moving-flow")
-    tensors |= {name: values for name, values in scene.items() if name.startswith("flow.scene.")}
-    flow, spec = manifest["spec"]["flow"], manifest["spec"]
-    flow["memory"], spec["states"], spec["camera"] = True, home["spec"]["states"], home["spec"]["camera"]
-    random = np.random.default_rng(1)
-    sizes = {"seen": (4, flow["stem_channels"]), "fine": (12, flow["fine_channels"]), "share": (flow["fine_channels"], 4)}
-    for name, (inputs, outputs) in sizes.items():
-        tensors[f"flow.memory.{name}.weight"] = random.normal(size=(9 * inputs, outputs)) / (9 * inputs)
-        tensors[f"flow.memory.{name}.bias"] = 0.5 * random.normal(size=outputs)
-    write_model(tmp_path, manifest, tensors)
-    by_numpy = ByNumpy(tmp_path)
-    window = by_numpy.window(drive, 4)
-    predicted, without = ByOnnx(tmp_path)(window)["predicted"][0], ByOnnx(MODELS / "rooms")(window)["predicted"][0]
-    assert np.abs(predicted - by_numpy.predict(window)).max() < DEPTH_TOLERANCE
-    assert np.abs(predicted - without).max() > 0.01
-
-
 def test_what_cannot_be_exported_is_named(tmp_path: Path) -> None:
     with pytest.raises(UnsupportedModel, match=r"not a directory with manifest\.json"):
         export_onnx(tmp_path)

@@ -100,6 +100,10 @@ fn rooms_is_scored_on_a_car_and_adapted_to_it_unless_it_gets_worse() {
         ),
         ("adapt car --name x --mirror angel", "no channel \"angel\""),
         (
+            "adapt car --name x --remember",
+            "no states x, y, heading_cos and heading_sin",
+        ),
+        (
             "adapt car --name x --set sequence.steps=5",
             "sequence.steps cannot be set for an adaptation: use steps",
         ),
@@ -131,6 +135,40 @@ fn rooms_is_scored_on_a_car_and_adapted_to_it_unless_it_gets_worse() {
         "{}",
         text(&refused.stderr)
     );
+}
+
+#[test]
+fn a_room_is_remembered_where_the_state_tells_the_pose() {
+    let dir = tempfile::tempdir().unwrap();
+    let models = Path::new(env!("CARGO_MANIFEST_DIR")).join("models");
+    let run = |arguments: &str| {
+        let own = ["--models-dir", models.to_str().unwrap()];
+        output(dir.path(), &arguments.split(' ').chain(own).collect::<Vec<_>>())
+    };
+    let collected = output(
+        dir.path(),
+        &"collect --scenario moving-observer --trials 12 --name drives"
+            .split(' ')
+            .collect::<Vec<_>>(),
+    );
+    assert!(collected.status.success(), "{}", text(&collected.stderr));
+    let remembering = "train --from rooms --dataset drives --set sequence.steps=4 --set sequence.batch_size=2 --set run.warmup_steps=0 --set model.flow.memory=true --out runs/home";
+    let trained = run(&format!("{remembering} --set data.hidden=0 --set data.mirror=off"));
+    assert!(trained.status.success(), "{}", text(&trained.stderr));
+    let scored = run("evaluate --model runs/home/model --dataset drives --windows 6 --nearest-windows 40");
+    assert!(scored.status.success(), "{}", text(&scored.stderr));
+    for (command, part) in [
+        (remembering, "set data.mirror to off and data.hidden to 0"),
+        ("adapt drives --name x --remember --mirror y", "cannot be used with"),
+    ] {
+        let refused = run(command);
+        assert_eq!(refused.status.code(), Some(2), "{command}");
+        assert!(
+            text(&refused.stderr).contains(part),
+            "{command}: {}",
+            text(&refused.stderr)
+        );
+    }
 }
 
 #[tokio::test]
@@ -219,6 +257,11 @@ async fn a_job_adapts_rooms_and_publishes_the_model_unless_it_gets_worse() {
             .contains("mirror: the data set has no channel \"angel\"")
     );
     assert!(refused("steps", json!(0)).await.starts_with("steps: 0 is out of range"));
+    let unplaced = refused("remember", json!(true)).await;
+    assert!(
+        unplaced.contains("remember: data set \"car\" has no states x, y"),
+        "{unplaced}"
+    );
     assert!(
         refused("settings", json!({"sequence": {"stepps": 1}}))
             .await

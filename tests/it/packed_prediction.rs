@@ -47,7 +47,7 @@ fn plans(spec: &ModelSpec, count: usize) -> ConditioningTensors {
 
 #[test]
 fn packed_weights_predict_what_the_tensors_predict() {
-    for name in ["moving-flow", "rooms", "static-flow"] {
+    for name in ["moving-flow", "rooms", "home", "static-flow"] {
         let (packed, on_tensors) = (packed(name), on_tensors(name));
         let (spec, windows) = (packed.spec(), [0, 1, 1, 0]);
         let (frames, plans) = (frames(spec, 2), plans(spec, windows.len()));
@@ -56,7 +56,7 @@ fn packed_weights_predict_what_the_tensors_predict() {
         let most = largest_difference(&packed, &expected);
         // Where depth is estimated, rounding moves a place, and so changes the depth found there; most in frames of noise.
         let bound = if spec.flow().is_some_and(|flow| flow.layers.depth) {
-            3e-5
+            4e-5
         } else {
             1e-5
         };
@@ -66,7 +66,7 @@ fn packed_weights_predict_what_the_tensors_predict() {
 
 #[test]
 fn many_plans_give_the_bits_that_each_alone_gives() {
-    for name in ["moving-flow", "rooms"] {
+    for name in ["moving-flow", "rooms", "home"] {
         let network = packed(name);
         let spec = network.spec();
         let (frames, plans) = (frames(spec, 1), plans(spec, 21));

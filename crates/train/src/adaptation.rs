@@ -21,6 +21,9 @@ const COMPARED_WINDOWS: usize = 100;
 /// Where a camera is taken to be whose height is not known, in metres: distances then count in units of it.
 const HEIGHT_M: f32 = 0.6;
 
+/// The state's channels that say where in its room the robot is.
+const POSE: [&str; 4] = ["x", "y", "heading_cos", "heading_sin"];
+
 /// How a model is adapted.
 #[derive(Clone, Debug)]
 pub struct AdaptSettings {
@@ -40,6 +43,30 @@ impl AdaptSettings {
     /// Updates, unless others are asked for.
     pub const STEPS: u32 = 1200;
 
+    /// Errors: `NoChannel`, `NoPose`, `Fixed`.
+    fn check_channels(&self, info: &DatasetInfo) -> Result<(), AdaptError> {
+        let states = info.state_channels.iter().map(|channel| channel.name.as_str());
+        let states: Vec<&str> = states.collect();
+        let actions = info.action_channels.iter().map(|channel| channel.name.as_str());
+        let channels: Vec<&str> = actions.chain(states.iter().copied()).collect();
+        if let Some(unknown) = self.mirror.iter().find(|name| !channels.contains(&name.as_str())) {
+            return Err(AdaptError::NoChannel {
+                name: unknown.clone(),
+                known: comma_separated(&channels),
+            });
+        }
+        if self.remember && !self.mirror.is_empty() {
+            return Err(AdaptError::Fixed(
+                "mirror",
+                "a mirrored room is not the one to remember",
+            ));
+        }
+        if self.remember && !POSE.iter().all(|name| states.contains(name)) {
+            return Err(AdaptError::NoPose(info.name.clone()));
+        }
+        Ok(())
+    }
+
     /// The settings of the training: those of the base, for what the data set has. Errors: `NotAdaptable`, and those of
     /// [`TrainConfig::of_model`].
     pub fn training(&self, base: &Manifest, info: &DatasetInfo) -> Result<TrainConfig, AdaptError> {
@@ -47,14 +74,7 @@ impl AdaptSettings {
             return Err(AdaptError::NotAdaptable(base.name.clone()));
         }
         evaluation::check_fit(base, info)?;
-        let channels = info.action_channels.iter().chain(&info.state_channels);
-        let channels: Vec<&str> = channels.map(|channel| channel.name.as_str()).collect();
-        if let Some(unknown) = self.mirror.iter().find(|name| !channels.contains(&name.as_str())) {
-            return Err(AdaptError::NoChannel {
-                name: unknown.clone(),
-                known: comma_separated(&channels),
-            });
-        }
+        self.check_channels(info)?;
         let conditioning = match (info.action_channels.is_empty(), info.state_channels.is_empty()) {
             (false, false) => Conditioning::StateAction,
             (false, true) => Conditioning::Action,
@@ -77,11 +97,11 @@ impl AdaptSettings {
                 channels => format!("data.mirror={channels:?}"),
             },
         ];
-        // A mirrored room would be another one, and without its pose it could not be told.
+        // Without the pose, the room could not be found.
         let remembering: &[&str] = if self.remember {
             &["model.flow.memory=true", "sequence.scene_weight=0.3", "data.hidden=0.0"]
         } else {
-            &[]
+            &["model.flow.memory=false"]
         };
         let settings = settings.iter().map(String::as_str).chain(remembering.iter().copied());
         let own = settings.map(SettingsLayer::assignment);

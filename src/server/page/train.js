@@ -119,16 +119,19 @@ function NewTraining({ datasets, jobs, submit }) {
     <div class="actions"><button class="main">Train</button><${Copy} curl=${() => curl("POST", "/v1/jobs", spec)} python=${() => requests("POST", "/v1/jobs", spec)} /></div></form>`;
 }
 
-// Whether a model sees how fast the camera drives, so that it can start on another robot.
-const canBeAdapted = ({ spec }) => Boolean(spec.flow?.speeds);
+// Whether a model sees how fast the camera drives, so that it can start on another robot. What remembers a room knows another one.
+const canBeAdapted = ({ spec }) => Boolean(spec.flow?.speeds && !spec.flow.memory);
+const POSE = ["x", "y", "heading_cos", "heading_sin"];
 
 function NewAdaptation({ models, datasets, submit }) {
   const [form, setForm] = useState({ mirror: [] });
   const dataset = datasets.find(({ name }) => name === form.dataset) ?? datasets.find(({ scenario }) => !scenario) ?? datasets[0];
   const from = form.from ?? models[0].name;
   const channels = [...new Set([...dataset.actions, ...dataset.states].map(({ name }) => name))];
-  const mirror = channels.filter(name => form.mirror.includes(name));
-  const spec = { kind: "adapt", name: form.name || `${dataset.name}-adapted`, dataset: dataset.name, from, ...(form.steps && { steps: +form.steps }), ...(mirror.length && { mirror }) };
+  const hasPose = POSE.every(channel => dataset.states.some(({ name }) => name === channel));
+  const remember = hasPose && Boolean(form.remember);
+  const mirror = channels.filter(name => !remember && form.mirror.includes(name));
+  const spec = { kind: "adapt", name: form.name || `${dataset.name}-adapted`, dataset: dataset.name, from, ...(form.steps && { steps: +form.steps }), ...(mirror.length && { mirror }), ...(remember && { remember }) };
   const set = name => event => setForm({ ...form, [name]: event.target.value });
   const turn = name => () => setForm({ ...form, mirror: form.mirror.includes(name) ? form.mirror.filter(other => other !== name) : [...form.mirror, name] });
   return html`<form class="card" onSubmit=${event => { event.preventDefault(); submit(spec); }}><h2>New adaptation</h2><div class="form">
@@ -136,7 +139,8 @@ function NewAdaptation({ models, datasets, submit }) {
       <label>Start from <select value=${from} onChange=${set("from")}>${models.map(({ name }) => html`<option value=${name}>${name}</option>`)}</select></label>
       <label>Name of the model <input value=${form.name} placeholder=${`${dataset.name}-adapted`} pattern="[a-z0-9][a-z0-9\\-]*" onInput=${set("name")} /></label>
       <label>Steps <input type="number" min="1" max="100000" value=${form.steps} placeholder="1200" onInput=${set("steps")} /></label>
-      ${channels.length > 0 && html`<fieldset class="wide"><legend>Changes its sign in a mirror</legend>${channels.map(name => html`<label><input type="checkbox" checked=${mirror.includes(name)} onChange=${turn(name)} /> ${name}</label>`)}</fieldset>`}
+      ${hasPose && html`<label class="wide"><input type="checkbox" checked=${remember} onChange=${() => setForm({ ...form, remember: !remember })} /> Remember the room: the robot stays in it, and its pose always counts from the same origin</label>`}
+      ${channels.length > 0 && !remember && html`<fieldset class="wide"><legend>Changes its sign in a mirror</legend>${channels.map(name => html`<label><input type="checkbox" checked=${mirror.includes(name)} onChange=${turn(name)} /> ${name}</label>`)}</fieldset>`}
     </div><p class="quiet">For the recording of a robot that drives: estimates its camera, then trains the model further, about five minutes on two cores. A model that became no better is not published. Mark all actions and states that say left or right, such as a steering angle; then half of the windows are mirrored.</p>
     <div class="actions"><button class="main">Adapt</button><${Copy} curl=${() => curl("POST", "/v1/jobs", spec)} python=${() => requests("POST", "/v1/jobs", spec)} /></div></form>`;
 }

@@ -25,6 +25,11 @@ pub enum AdaptError {
         /// Those that there are.
         known: String,
     },
+    /// A room cannot be remembered without the place in it.
+    #[error(
+        "data set \"{0}\" has no states x, y, heading_cos and heading_sin, so no room can be remembered: nothing says where the robot is in it"
+    )]
+    NoPose(String),
     /// A setting is fixed by the model to start from, or has a field of its own.
     #[error("{0} cannot be set for an adaptation: {1}")]
     Fixed(&'static str, &'static str),
@@ -47,9 +52,11 @@ pub enum AdaptError {
 impl HasErrorKind for AdaptError {
     fn kind(&self) -> ErrorKind {
         match self {
-            Self::NotAdaptable(_) | Self::NoChannel { .. } | Self::Fixed(..) | Self::NothingToJudge(_) => {
-                ErrorKind::Usage
-            }
+            Self::NotAdaptable(_)
+            | Self::NoChannel { .. }
+            | Self::NoPose(_)
+            | Self::Fixed(..)
+            | Self::NothingToJudge(_) => ErrorKind::Usage,
             Self::Settings(error) => error.kind(),
             Self::Train(error) => error.kind(),
             Self::Evaluation(error) => error.kind(),

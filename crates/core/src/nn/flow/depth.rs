@@ -7,6 +7,7 @@ use rayon::prelude::*;
 use super::blocks::sampled_blocks;
 use super::depth_head::{DepthHead, SeenPlaces};
 use super::depth_views::DepthViews;
+use super::memory::RecalledItems;
 use super::network::{FlowNetwork, Surroundings};
 use super::occupancy::{Occupancy, OccupancyView};
 use super::reprojection::{Reprojection, reproject};
@@ -205,7 +206,19 @@ impl FlowNetwork {
             .map(|&context| views.levels[context as usize])
             .collect();
         let memory = self.memory.as_ref();
-        let recalled = memory.map(|memory| memory.recall(ahead, &levels)).transpose()?;
+        let recalled = match memory {
+            Some(memory) => {
+                let [_, poses] = ahead.poses()?;
+                Some(memory.recall(RecalledItems {
+                    rows: ahead.rows,
+                    row_of: ahead.row_of(),
+                    motion: ahead.motion()?,
+                    poses,
+                    levels: &levels,
+                })?)
+            }
+            None => None,
+        };
         let beside = seen.beside_pixels(views, &context_of, size)?;
         let fine = self.fine(
             &state,

@@ -8,8 +8,8 @@ use candle_core::{Device, Result as TensorResult, Tensor};
 
 use super::blocks::{content_blocks, content_frames};
 use super::encoder_views::EncoderViews;
+use super::rollout_rows::RolloutRows;
 use super::scene::Scene;
-use super::steps_ahead::StepsAhead;
 use crate::nn::error::NnError;
 use crate::nn::geometry::camera::CameraPose;
 use crate::nn::model_tensors::ModelTensors;
@@ -33,6 +33,19 @@ pub(super) struct Memory {
     pub(super) fine: Convolution3,
     /// From the fine layer to the logits of how much the remembered pixels count.
     pub(super) share: Convolution3,
+}
+
+/// The items whose room is remembered.
+pub(super) struct RecalledItems<'a> {
+    pub(super) rows: &'a RolloutRows<'a>,
+    /// The row of each item's rollout.
+    pub(super) row_of: Vec<usize>,
+    /// How the camera will have moved, `[M, 3]`.
+    pub(super) motion: Tensor,
+    /// Where it will stand.
+    pub(super) poses: Vec<CameraPose>,
+    /// Mean and spread of each item's last frame.
+    pub(super) levels: &'a [[f32; 2]],
 }
 
 /// The room as it is remembered at predicted frames.
@@ -77,27 +90,26 @@ impl Memory {
         let count = contexts.count();
         let content = self.scene.content_now(contexts)?;
         let content = Tensor::from_vec(content, (count, half.height, half.width, 4), &Device::Cpu)?;
-        let content = Levels::of(levels, &[count, 1, 1, 1])?.count(&content)?;
+        let content = FrameLevels::of(levels, &[count, 1, 1, 1])?.count(&content)?;
         let added = activated_convolution(&self.seen, &content, Activation::None, None)?;
         Ok(added.broadcast_mul(&Tensor::from_vec(is_known, (count, 1, 1, 1), &Device::Cpu)?)?)
     }
 
-    /// The room at these steps. `levels`: mean and spread of each item's last frame.
-    pub(super) fn recall(&self, ahead: &StepsAhead, levels: &[[f32; 2]]) -> Result<Recalled, NnError> {
-        let [_, mut poses] = ahead.poses()?;
-        let is_known = known_poses(&mut poses);
-        let count = is_known.len();
+    /// The room at these items.
+    pub(super) fn recall(&self, mut items: RecalledItems) -> Result<Recalled, NnError> {
+        let is_known = known_poses(&mut items.poses);
+        let (count, levels) = (is_known.len(), items.levels);
         let scene = self
             .scene
-            .forward(ahead.rows, &ahead.row_of(), &ahead.motion()?, &poses)?;
+            .forward(items.rows, &items.row_of, &items.motion, &items.poses)?;
         let (content, intensities) = (content_blocks(&scene)?, content_frames(&scene)?);
-        let counted = Levels::of(levels, &[count, 1, 1, 1])?.count(&content)?;
+        let counted = FrameLevels::of(levels, &[count, 1, 1, 1])?.count(&content)?;
         let features = scene.narrow(3, 0, SCENE_FEATURES)?;
         let read = Tensor::cat(&[&features, &counted], 3)?;
         let is_known = Tensor::from_vec(is_known, (count, 1), &Device::Cpu)?;
         let fine = activated_convolution(&self.fine, &read, Activation::None, None)?;
         Ok(Recalled {
-            content: Levels::of(levels, &[count, 1])?.count(&intensities)?,
+            content: FrameLevels::of(levels, &[count, 1])?.count(&intensities)?,
             intensities,
             fine: fine.broadcast_mul(&is_known.reshape((count, 1, 1, 1))?)?,
             is_known,
@@ -133,12 +145,12 @@ pub(super) fn known_poses(poses: &mut [CameraPose]) -> Vec<f32> {
 }
 
 /// Means and spreads of last frames, in a shape that can be broadcast.
-struct Levels {
+struct FrameLevels {
     mean: Tensor,
     spread: Tensor,
 }
 
-impl Levels {
+impl FrameLevels {
     fn of(levels: &[[f32; 2]], shape: &[usize]) -> TensorResult<Self> {
         let part = |part: usize| {
             let values: Vec<f32> = levels.iter().map(|levels| levels[part]).collect();

@@ -96,7 +96,8 @@ impl Pipeline {
         let config = spec.settings()?.training(&base, &info).map_err(|error| {
             let field = match error {
                 AdaptError::NotAdaptable(_) => "from",
-                AdaptError::NoChannel { .. } => "mirror",
+                AdaptError::NoChannel { .. } | AdaptError::Fixed("mirror", _) => "mirror",
+                AdaptError::NoPose(_) => "remember",
                 AdaptError::Evaluation(_) => "dataset",
                 _ => "settings",
             };
