@@ -257,10 +257,10 @@ async fn a_job_adapts_rooms_and_publishes_the_model_unless_it_gets_worse() {
             .contains("mirror: the data set has no channel \"angel\"")
     );
     assert!(refused("steps", json!(0)).await.starts_with("steps: 0 is out of range"));
-    let unplaced = refused("remember", json!(true)).await;
+    let mirrored = refused("remember", json!(true)).await;
     assert!(
-        unplaced.contains("remember: data set \"car\" has no states x, y"),
-        "{unplaced}"
+        mirrored.contains("a mirrored room is not the one to remember"),
+        "{mirrored}"
     );
     assert!(
         refused("settings", json!({"sequence": {"stepps": 1}}))
