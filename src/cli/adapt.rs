@@ -43,8 +43,8 @@ pub(super) struct AdaptArgs {
     /// mirrored
     #[arg(long, value_name = "CHANNEL")]
     mirror: Vec<String>,
-    /// Also remember what the room of the recording looks like, for a robot that stays in it. Its states must have x, y, heading_cos
-    /// and heading_sin, always from the same origin
+    /// Also remember what the room of the recording looks like, for a robot that stays in it. Its states must have x, y, `heading_cos`
+    /// and `heading_sin`, always from the same origin
     #[arg(long, conflicts_with = "mirror")]
     remember: bool,
     /// Another setting of the training, as in data.brightness=0; may be repeated

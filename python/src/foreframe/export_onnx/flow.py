@@ -110,11 +110,11 @@ class FlowLayers:
         ]
         lost = [np.minimum(2 * place.outside(self.shape), 8) for place in (room, turned)]
         logits = concat([part[4] + 1.5 - lost[0], part[5] - lost[1], part[6]])
-        drawn = total(concat(values) * logits.graph.node("Softmax", logits, axis=1), 1)
-        if remembered is None:
-            return drawn
-        share = shuffle(layers.conv3(fine, "flow.memory.share"))
-        return drawn + (shuffle(remembered[:, 8:]) - drawn) / (1 + np.exp(3 - share))
+        drawn: Tensor = total(concat(values) * logits.graph.node("Softmax", logits, axis=1), 1)
+        if remembered is not None:
+            share = shuffle(layers.conv3(fine, "flow.memory.share"))
+            drawn = drawn + (shuffle(remembered[:, 8:]) - drawn) / (1 + np.exp(3 - share))
+        return drawn
 
     def sampled(self, image: Tensor, place: Place) -> Tensor:
         """The image at places. Those that are constant are the pixels' own."""

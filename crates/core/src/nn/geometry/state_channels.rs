@@ -171,8 +171,7 @@ impl ModelSpec {
     }
 
     /// Whether the depth form remembers one room, which it finds by the absolute pose.
-    #[must_use]
-    pub fn remembers_room(&self) -> bool {
+    pub(in crate::nn) fn remembers_room(&self) -> bool {
         self.flow().is_some_and(|flow| flow.layers.memory)
     }
 
