@@ -60,6 +60,7 @@ fn network(spec: &ModelSpec) -> String {
             let layers = &flow.layers;
             let camera = if flow.camera.is_some() { "known" } else { "unknown" };
             let form = match (layers.depth, layers.recurrent) {
+                (true, _) if layers.memory => "flow with depth and memory",
                 (true, _) => "flow with depth",
                 (false, true) => "recurrent flow",
                 (false, false) => "flow",

@@ -64,7 +64,8 @@ impl<'a> SequenceObjective<'a> {
             loss = (loss + (similarity * sequence.ssim_weight)?)?;
         }
         if let Some(scene) = predicted.scene.filter(|_| sequence.scene_weight > 0.0) {
-            let scene = sequence.loss.between(&scene, &batch.targets)?;
+            let truth = batch.targets.narrow(1, 0, scene.dim(1)?)?.contiguous()?;
+            let scene = sequence.loss.between(&scene, &truth)?;
             loss = (loss + (scene * sequence.scene_weight)?)?;
         }
         let squared = |found: &Tensor, truth: &Tensor| Loss::Mse.between(found, truth);

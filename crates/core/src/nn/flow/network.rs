@@ -26,7 +26,7 @@ pub struct FlowPrediction {
     /// The predicted frames `[N, steps, P]`, those of the whole horizon unless fewer were asked for.
     pub frames: Tensor,
     /// What the scene alone looks like, without what moves in it: `[N, horizon, P]` where gradients go to the weights and in the
-    /// recurrent form, else `[N, steps, P]`; `None` where the model remembers none.
+    /// recurrent form, else, and in the depth form, `[N, steps, P]`; `None` where the model remembers none.
     pub scene: Option<Tensor>,
     /// How the camera will have moved since the last frame: yaw, ahead, left `[N, horizon, 3]`, in radians and metres.
     pub motion: Tensor,
