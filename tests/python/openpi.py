@@ -53,7 +53,7 @@ passed("401 without the right key")
 
 policy = WebsocketClientPolicy(host, port, api_key=key)
 about = policy.get_server_metadata()
-assert about["server"] == "foreframe" and about["model"] == "moving-flow" and "moving-flow" in about["models"] and about["spec"]["context"] == 5
+assert about["server"] == "foreframe" and about["model"] == "home" and "moving-flow" in about["models"] and about["spec"]["context"] == 5
 passed("metadata")
 
 for number in range(4):
