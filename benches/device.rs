@@ -15,7 +15,7 @@ use foreframe_core::registry::{self, Model};
 #[global_allocator]
 static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 
-const MODELS: [&str; 6] = ["static", "moving", "static-flow", "donkeycar", "moving-flow", "rooms"];
+const MODELS: [&str; 7] = ["static", "moving", "static-flow", "donkeycar", "moving-flow", "rooms", "home"];
 const ROUNDS: usize = 5;
 const WINDOWS: usize = 64;
 const PLANS: usize = 256;

@@ -439,7 +439,7 @@ class FlowNetwork:
         return z
 
     def drawn(self, z, last, beside, content, room, turned, remembered=None):
-        """The frame of a state: pixels of the last frame, moved in two ways, and content, mixed; and then with what is remembered."""
+        """The frame of a state: pixels of the last frame, moved in two ways, content, and what is remembered."""
         enlarged = shuffle(dense(silu(z), self.tensors, "flow.enlarge"))
         inside = (outside(room, self.shape) == 0).astype(np.float32)[..., None]
         moved_pixels = unshuffle(sample(last, room)[..., None])
@@ -479,7 +479,7 @@ class DepthNetwork(FlowNetwork):
         self.place_values = np.stack([columns, rows, inverse], 2)
 
     def scaled_state(self, state):
-        """Without the pose, which only says how the camera has moved."""
+        """Without the pose: it says how the camera has moved, and to a memory where it is."""
         read = [place for place in range(len(self.states)) if place not in (self.pose_channels or [])]
         return super().scaled_state(state)[read]
 
@@ -517,8 +517,8 @@ class DepthNetwork(FlowNetwork):
             shifts.append(shift)
         x = np.concatenate(blocks + shifts + [self.place_values], 2).astype(np.float32)
         seen = conv3(x, self.tensors, "flow.stem")
-        if self.spec["flow"].get("memory", False):
-            now = self.remembered(states[-1], np.zeros(3), mean, spread)
+        now = self.remembered(states[-1], np.zeros(3), mean, spread)
+        if now is not None:
             seen = seen + conv3(now[..., 8:], self.tensors, "flow.memory.seen")
         first = silu(seen)
         coarse = self.encoded(first)

@@ -2,6 +2,7 @@
 
 use std::fmt::Write as _;
 use std::path::Path;
+use std::process::Output;
 
 use foreframe::server::ServerConfig;
 use foreframe_core::frame::codec;
@@ -32,6 +33,13 @@ fn record_car(dir: &Path) {
         &["import", "recorded", "--csv", "recorded/car.csv", "--name", "car"],
     );
     assert!(imported.status.success(), "{}", text(&imported.stderr));
+}
+
+/// That a command was refused with these words.
+fn assert_refused(command: &str, words: &str, refused: &Output) {
+    let said = text(&refused.stderr);
+    assert_eq!(refused.status.code(), Some(2), "{command}");
+    assert!(said.contains(words), "{command}: {said}");
 }
 
 #[test]
@@ -120,13 +128,7 @@ fn rooms_is_scored_on_a_car_and_adapted_to_it_unless_it_gets_worse() {
             "that needs data.windows = \"all\"",
         ),
     ] {
-        let refused = run(command);
-        assert_eq!(refused.status.code(), Some(2), "{command}");
-        assert!(
-            text(&refused.stderr).contains(part),
-            "{command}: {}",
-            text(&refused.stderr)
-        );
+        assert_refused(command, part, &run(command));
     }
     let refused = run("adapt car --from moving-flow");
     assert_eq!(refused.status.code(), Some(2));
@@ -152,7 +154,8 @@ fn a_room_is_remembered_where_the_state_tells_the_pose() {
             .collect::<Vec<_>>(),
     );
     assert!(collected.status.success(), "{}", text(&collected.stderr));
-    let remembering = "train --from rooms --dataset drives --set sequence.steps=4 --set sequence.batch_size=2 --set run.warmup_steps=0 --set model.flow.memory=true --out runs/home";
+    let remembering = "train --from rooms --dataset drives --set sequence.steps=4 --set sequence.batch_size=2 \
+        --set run.warmup_steps=0 --set model.flow.memory=true --out runs/home";
     let trained = run(&format!("{remembering} --set data.hidden=0 --set data.mirror=off"));
     assert!(trained.status.success(), "{}", text(&trained.stderr));
     let scored = run("evaluate --model runs/home/model --dataset drives --windows 6 --nearest-windows 40");
@@ -161,13 +164,7 @@ fn a_room_is_remembered_where_the_state_tells_the_pose() {
         (remembering, "set data.mirror to off and data.hidden to 0"),
         ("adapt drives --name x --remember --mirror y", "cannot be used with"),
     ] {
-        let refused = run(command);
-        assert_eq!(refused.status.code(), Some(2), "{command}");
-        assert!(
-            text(&refused.stderr).contains(part),
-            "{command}: {}",
-            text(&refused.stderr)
-        );
+        assert_refused(command, part, &run(command));
     }
 }
 

@@ -47,6 +47,8 @@ pub use conditioning::ConditioningTensors;
 pub use dense::Feedback;
 pub use error::{NnError, TensorError};
 pub use flow::{FlowPrediction, Occupancy};
+#[doc(hidden)]
+pub use geometry::state_channels::POSE_CHANNELS;
 pub use loss::Loss;
 pub use network::Network;
 pub use options::{ArchitectureKind, Conditioning, PredictorOutput, Reconstruction, UnknownName};

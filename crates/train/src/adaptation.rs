@@ -10,7 +10,7 @@ use crate::evaluation::{self, CameraEstimate};
 use crate::settings::SettingsLayer;
 use crate::training::TrainConfig;
 use foreframe_core::error_text::comma_separated;
-use foreframe_core::nn::Conditioning;
+use foreframe_core::nn::{Conditioning, POSE_CHANNELS};
 use foreframe_core::registry::{Manifest, Model};
 use foreframe_core::types::ModelName;
 use foreframe_data::dataset::sampler::Split;
@@ -20,9 +20,6 @@ use foreframe_data::dataset::{Dataset, DatasetInfo, Window};
 const COMPARED_WINDOWS: usize = 100;
 /// Where a camera is taken to be whose height is not known, in metres: distances then count in units of it.
 const HEIGHT_M: f32 = 0.6;
-
-/// The state's channels that say where in its room the robot is.
-const POSE: [&str; 4] = ["x", "y", "heading_cos", "heading_sin"];
 
 /// How a model is adapted.
 #[derive(Clone, Debug)]
@@ -61,7 +58,7 @@ impl AdaptSettings {
                 "a mirrored room is not the one to remember",
             ));
         }
-        if self.remember && !POSE.iter().all(|name| states.contains(name)) {
+        if self.remember && !POSE_CHANNELS.iter().all(|name| states.contains(name)) {
             return Err(AdaptError::NoPose(info.name.clone()));
         }
         Ok(())

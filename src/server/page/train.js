@@ -119,7 +119,7 @@ function NewTraining({ datasets, jobs, submit }) {
     <div class="actions"><button class="main">Train</button><${Copy} curl=${() => curl("POST", "/v1/jobs", spec)} python=${() => requests("POST", "/v1/jobs", spec)} /></div></form>`;
 }
 
-// Whether a model sees how fast the camera drives, so that it can start on another robot. What remembers a room knows another one.
+// Whether a model sees how fast the camera drives, so that another robot can start from it. One that remembers a room is not offered.
 const canBeAdapted = ({ spec }) => Boolean(spec.flow?.speeds && !spec.flow.memory);
 const POSE = ["x", "y", "heading_cos", "heading_sin"];
 

@@ -45,7 +45,7 @@ pub(super) fn tensor(name: &str, shape: &[usize], seed: Seed) -> Result<Tensor, 
 fn flow_gain(layer: &str) -> f32 {
     match layer {
         "flow.motion.output" | "flow.affine" | "flow.depth.output" => 0.0,
-        // A memory starts as if it were not there.
+        // What reads a memory starts without effect, but for its small constant share.
         _ if layer.starts_with("flow.memory.") => 0.0,
         "flow.modulation.output" | "flow.head" | "flow.advance" | "flow.speeds.votes" => 0.1,
         _ if layer.ends_with(".second") => 0.0,

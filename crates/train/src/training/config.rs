@@ -270,7 +270,7 @@ impl TrainConfig {
         matches!(self.model.architecture, ArchitectureConfig::Flow(layers) if layers.speeds)
     }
 
-    /// Whether the network remembers one room.
+    /// Whether the network remembers one room, for which the pose must be known.
     pub(super) fn remembers_room(&self) -> bool {
         matches!(self.model.architecture, ArchitectureConfig::Flow(layers) if layers.memory)
     }

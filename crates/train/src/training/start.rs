@@ -20,8 +20,8 @@ const OPTIONAL_PREFIXES: [&str; 5] = [
     "flow.scene.",
 ];
 
-/// The weights of another model. What only this training's network has, of movers, speeds, motion and memory, starts at random, and what
-/// only the other one has of them is left out. If this network sees how fast the camera drives, states and actions may be others
+/// The weights of another model. What only this training's network has, of movers, speeds, motion and memory, starts as in a new
+/// network, and what only the other one has of them is left out. If this network sees how fast the camera drives, states and actions may be others
 /// too: the weights of those that both have stay, and those of new ones start at 0.
 /// Errors: `OtherNetwork` if they do not fit this training's network, `OtherUnits`.
 pub(super) fn parameters(plan: &TrainingPlan<'_>, start: &StoredWeights, seed: Seed) -> Result<Parameters, TrainError> {

@@ -62,7 +62,7 @@ class DepthNetwork(FlowLayers):
         super().__init__(model)
         self.pose_channels = pose_channels(self.states)
         self.read_states = [channel for channel in self.read_states if channel not in (self.pose_channels or [])]
-        remembers = self.pose_channels and self.sizes.get("memory", False)
+        remembers = self.sizes.get("memory", False)
         self.room = Room(self.spec, self.layers, self.pose_channels) if remembers and self.pose_channels else None
 
     def add_window(self, graph: Graph) -> None:

@@ -93,7 +93,7 @@ class FlowLayers:
     def drawn(
         self, z: Tensor, last: Tensor, beside: Tensor, content: Value, room: Place, turned: Place, remembered: Value = None
     ) -> Tensor:
-        """The frame of a state: pixels of the last frame, moved in two ways, and content, mixed; and then with what is remembered."""
+        """The frame of a state: pixels of the last frame, moved in two ways, content, and what is remembered."""
         layers, moved = self.layers, self.sampled(last, room)
         enlarged = shuffle(layers.at_each_place(silu(z), "flow.enlarge"))
         share = block_mean(inside(room.outside(self.shape), last))

@@ -1,13 +1,13 @@
 //! The form of the flow network that estimates depth: what the last frame shows is placed in space, and seen from where the
-//! camera will be. It remembers no place, so it serves in rooms that it never saw.
+//! camera will be. Without a memory it knows no place, so it serves in rooms that it never saw.
 
 use candle_core::{DType, Device, Tensor};
 use rayon::prelude::*;
 
 use super::blocks::sampled_blocks;
 use super::depth_head::{DepthHead, SeenPlaces};
-use super::depth_views::DepthViews;
-use super::memory::RecalledItems;
+use super::depth_views::{DepthViews, FrameLevels};
+use super::memory::{Memory, Recalled, known_poses};
 use super::network::{FlowNetwork, Surroundings};
 use super::occupancy::{Occupancy, OccupancyView};
 use super::reprojection::{Reprojection, reproject};
@@ -145,10 +145,10 @@ impl FlowNetwork {
     pub(super) fn see_depth(&self, rows: &RolloutRows, head: &DepthHead) -> Result<SeenDepths, NnError> {
         let mut contexts = rows.contexts(self.sizes.layers.frames_read);
         let mut views = DepthViews::of(&contexts);
-        let memory = self.memory.as_ref();
-        let remembered = memory
-            .map(|memory| memory.now(&mut contexts, &views.levels))
-            .transpose()?;
+        let remembered = match &self.memory {
+            Some(memory) => Some(memory.now(&mut contexts, &FrameLevels::of(&views.levels)?)?),
+            None => None,
+        };
         let inputs = std::mem::take(&mut views.inputs);
         let features = self.encode(contexts.count(), inputs, remembered.as_ref())?;
         let depths = head.forward(&features, &views)?;
@@ -205,20 +205,9 @@ impl FlowNetwork {
             .iter()
             .map(|&context| views.levels[context as usize])
             .collect();
+        let levels = FrameLevels::of(&levels)?;
         let memory = self.memory.as_ref();
-        let recalled = match memory {
-            Some(memory) => {
-                let [_, poses] = ahead.poses()?;
-                Some(memory.recall(RecalledItems {
-                    rows: ahead.rows,
-                    row_of: ahead.row_of(),
-                    motion: ahead.motion()?,
-                    poses,
-                    levels: &levels,
-                })?)
-            }
-            None => None,
-        };
+        let recalled = memory.map(|memory| recall(memory, ahead, &levels)).transpose()?;
         let beside = seen.beside_pixels(views, &context_of, size)?;
         let fine = self.fine(
             &state,
@@ -239,11 +228,7 @@ impl FlowNetwork {
         if let (Some(memory), Some(recalled)) = (memory, &recalled) {
             frames = memory.mix(&frames, &fine, recalled)?;
         }
-        let level = |part: usize| -> Result<Tensor, NnError> {
-            let levels: Vec<f32> = levels.iter().map(|levels| levels[part]).collect();
-            Ok(Tensor::from_vec(levels, (context_of.len(), 1), &Device::Cpu)?)
-        };
-        let frames = frames.broadcast_mul(&level(1)?)?.broadcast_add(&level(0)?)?;
+        let frames = levels.intensities(&frames)?;
         Ok(PredictedAhead {
             frames: frames.reshape(shape)?,
             scene: recalled
@@ -252,4 +237,14 @@ impl FlowNetwork {
             movers: movers.map(|movers| movers.reshape(shape)).transpose()?,
         })
     }
+}
+
+/// The room at these steps, as it is remembered.
+fn recall(memory: &Memory, ahead: &StepsAhead, levels: &FrameLevels) -> Result<Recalled, NnError> {
+    let [_, mut poses] = ahead.poses()?;
+    let is_known = known_poses(&mut poses);
+    let scene = memory
+        .scene
+        .forward(ahead.rows, &ahead.row_of(), &ahead.motion()?, &poses)?;
+    memory.recall(&scene, is_known, levels)
 }

@@ -6,6 +6,7 @@
 // A closure's vector instructions reach what is inlined into it, and only that.
 #![allow(clippy::inline_always)]
 
+use candle_core::{Device, Result, Tensor};
 use rayon::prelude::*;
 
 use super::blocks::centred;
@@ -91,6 +92,38 @@ impl DepthViews {
             views.viewers.push(viewer);
         }
         views
+    }
+}
+
+/// Means and spreads of last frames as tensors, one for each item, `[M, 1]`.
+pub(super) struct FrameLevels {
+    mean: Tensor,
+    spread: Tensor,
+}
+
+impl FrameLevels {
+    pub(super) fn of(levels: &[[f32; 2]]) -> Result<Self> {
+        let part = |part: usize| {
+            let values: Vec<f32> = levels.iter().map(|levels| levels[part]).collect();
+            Tensor::from_vec(values, (levels.len(), 1), &Device::Cpu)
+        };
+        Ok(Self {
+            mean: part(0)?,
+            spread: part(1)?,
+        })
+    }
+
+    /// Intensities of blocks `[M, H/2, W/2, …]`, counted from the mean in the spread.
+    pub(super) fn counted(&self, blocks: &Tensor) -> Result<Tensor> {
+        let over_blocks = |level: &Tensor| level.unsqueeze(2)?.unsqueeze(3);
+        blocks
+            .broadcast_sub(&over_blocks(&self.mean)?)?
+            .broadcast_div(&over_blocks(&self.spread)?)
+    }
+
+    /// Frames `[M, P]` that were counted so, as intensities.
+    pub(super) fn intensities(&self, counted: &Tensor) -> Result<Tensor> {
+        counted.broadcast_mul(&self.spread)?.broadcast_add(&self.mean)
     }
 }
 

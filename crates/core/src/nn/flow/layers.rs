@@ -178,8 +178,8 @@ fn layer_sizes(spec: &ModelSpec, flow: &FlowSpec) -> Vec<LayerSize> {
     layers
 }
 
-/// The layers that see depth, movers and speeds, and those that read the memory: name, inputs, outputs and rows of each, on the grids of half and of a quarter of the
-/// sides.
+/// The layers that see depth, movers and speeds, and those that read what is remembered: name, inputs, outputs and rows of each, on the
+/// grids of half and of a quarter of the sides.
 fn seeing_layers(
     sizes: &FlowLayers,
     [half, quarter]: [usize; 2],

@@ -6,9 +6,9 @@
 
 use candle_core::{Device, Result as TensorResult, Tensor};
 
-use super::blocks::{content_blocks, content_frames};
+use super::blocks::{BLOCK_PIXELS, content_blocks, content_frames};
+use super::depth_views::FrameLevels;
 use super::encoder_views::EncoderViews;
-use super::rollout_rows::RolloutRows;
 use super::scene::Scene;
 use crate::nn::error::NnError;
 use crate::nn::geometry::camera::CameraPose;
@@ -33,19 +33,6 @@ pub(super) struct Memory {
     pub(super) fine: Convolution3,
     /// From the fine layer to the logits of how much the remembered pixels count.
     pub(super) share: Convolution3,
-}
-
-/// The items whose room is remembered.
-pub(super) struct RecalledItems<'a> {
-    pub(super) rows: &'a RolloutRows<'a>,
-    /// The row of each item's rollout.
-    pub(super) row_of: Vec<usize>,
-    /// How the camera will have moved, `[M, 3]`.
-    pub(super) motion: Tensor,
-    /// Where it will stand.
-    pub(super) poses: Vec<CameraPose>,
-    /// Mean and spread of each item's last frame.
-    pub(super) levels: &'a [[f32; 2]],
 }
 
 /// The room as it is remembered at predicted frames.
@@ -82,35 +69,27 @@ impl Memory {
         Ok(())
     }
 
-    /// What the encoder's first layer adds for these contexts, `[contexts, H/2, W/2, …]`. `levels`: mean and spread of their last
-    /// frames.
-    pub(super) fn now(&self, contexts: &mut EncoderViews, levels: &[[f32; 2]]) -> Result<Tensor, NnError> {
+    /// What the encoder's first layer adds for these contexts, `[contexts, H/2, W/2, …]`.
+    pub(super) fn now(&self, contexts: &mut EncoderViews, levels: &FrameLevels) -> Result<Tensor, NnError> {
         let is_known = known_poses(&mut contexts.poses);
         let half = contexts.spec.image_size().shrunk(2);
         let count = contexts.count();
         let content = self.scene.content_now(contexts)?;
-        let content = Tensor::from_vec(content, (count, half.height, half.width, 4), &Device::Cpu)?;
-        let content = FrameLevels::of(levels, &[count, 1, 1, 1])?.count(&content)?;
-        let added = activated_convolution(&self.seen, &content, Activation::None, None)?;
+        let content = Tensor::from_vec(content, (count, half.height, half.width, BLOCK_PIXELS), &Device::Cpu)?;
+        let added = activated_convolution(&self.seen, &levels.counted(&content)?, Activation::None, None)?;
         Ok(added.broadcast_mul(&Tensor::from_vec(is_known, (count, 1, 1, 1), &Device::Cpu)?)?)
     }
 
-    /// The room at these items.
-    pub(super) fn recall(&self, mut items: RecalledItems) -> Result<Recalled, NnError> {
-        let is_known = known_poses(&mut items.poses);
-        let (count, levels) = (is_known.len(), items.levels);
-        let scene = self
-            .scene
-            .forward(items.rows, &items.row_of, &items.motion, &items.poses)?;
-        let (content, intensities) = (content_blocks(&scene)?, content_frames(&scene)?);
-        let counted = FrameLevels::of(levels, &[count, 1, 1, 1])?.count(&content)?;
-        let features = scene.narrow(3, 0, SCENE_FEATURES)?;
-        let read = Tensor::cat(&[&features, &counted], 3)?;
+    /// What the scene `[M, H/2, W/2, SCENE_CHANNELS]` at the items, seen from [`known_poses`], gives to their frames.
+    pub(super) fn recall(&self, scene: &Tensor, is_known: Vec<f32>, levels: &FrameLevels) -> Result<Recalled, NnError> {
+        let count = is_known.len();
         let is_known = Tensor::from_vec(is_known, (count, 1), &Device::Cpu)?;
+        let counted = levels.counted(&content_blocks(scene)?)?;
+        let read = Tensor::cat(&[&scene.narrow(3, 0, SCENE_FEATURES)?, &counted], 3)?;
         let fine = activated_convolution(&self.fine, &read, Activation::None, None)?;
         Ok(Recalled {
-            content: FrameLevels::of(levels, &[count, 1])?.count(&intensities)?,
-            intensities,
+            content: pixel_shuffle(&counted)?.flatten_from(1)?,
+            intensities: content_frames(scene)?,
             fine: fine.broadcast_mul(&is_known.reshape((count, 1, 1, 1))?)?,
             is_known,
         })
@@ -142,28 +121,4 @@ pub(super) fn known_poses(poses: &mut [CameraPose]) -> Vec<f32> {
         f32::from(u8::from(is_known))
     });
     each.collect()
-}
-
-/// Means and spreads of last frames, in a shape that can be broadcast.
-struct FrameLevels {
-    mean: Tensor,
-    spread: Tensor,
-}
-
-impl FrameLevels {
-    fn of(levels: &[[f32; 2]], shape: &[usize]) -> TensorResult<Self> {
-        let part = |part: usize| {
-            let values: Vec<f32> = levels.iter().map(|levels| levels[part]).collect();
-            Tensor::from_vec(values, shape, &Device::Cpu)
-        };
-        Ok(Self {
-            mean: part(0)?,
-            spread: part(1)?,
-        })
-    }
-
-    /// Intensities as values counted from the mean in the spread.
-    fn count(&self, intensities: &Tensor) -> TensorResult<Tensor> {
-        intensities.broadcast_sub(&self.mean)?.broadcast_div(&self.spread)
-    }
 }

@@ -7,6 +7,9 @@ use super::wheel_dynamics::CommandedSpeeds;
 use crate::nn::error::NnError;
 use crate::nn::spec::{ChannelScale, ModelSpec};
 
+/// The names of the state's channels that say where the robot is.
+pub const POSE_CHANNELS: [&str; 4] = ["x", "y", "heading_cos", "heading_sin"];
+
 /// Which channels say how the robot moves and where it is.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(in crate::nn) struct StateChannels {
@@ -35,7 +38,7 @@ impl StateChannels {
             &[]
         };
         let named = |name: &str| states.iter().position(|channel| channel.name == name);
-        let pose = match ["x", "y", "heading_cos", "heading_sin"].map(named) {
+        let pose = match POSE_CHANNELS.map(named) {
             [Some(x), Some(y), Some(cos), Some(sin)] => Some([x, y, cos, sin]),
             _ => None,
         };

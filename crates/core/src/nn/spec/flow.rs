@@ -45,7 +45,7 @@ pub struct FlowLayers {
     /// Frames that the encoder reads: the last ones of the context.
     pub frames_read: usize,
     /// Whether the depth of what the last frame shows is estimated from the context under its known motion, and the camera
-    /// moved through it, instead of remembering what one place looks like. Such a model reads no absolute pose.
+    /// moved through it, instead of remembering what one place looks like. Without `memory`, such a model reads no absolute pose.
     pub depth: bool,
     /// Whether it also tells where movers are: other robots, in the last frame and in each predicted one. Only with `depth`;
     /// training needs masks of them.

@@ -126,8 +126,8 @@ impl TrainConfig {
         }
         if self.remembers_room() && (self.data.hidden > 0.0 || self.data.mirror != Mirror::Off) {
             return refused(format!(
-                "model.flow.memory is true, but a mirrored room is another room, and without the pose the room cannot be remembered; \
-                 set data.mirror to off and data.hidden to 0 ({} now)",
+                "model.flow.memory is true, so set data.mirror to off and data.hidden to 0 (now {}): a mirrored room is another one, and \
+                 a hidden pose does not say where the room is seen from",
                 self.data.hidden
             ));
         }
