@@ -12,27 +12,37 @@ use serde_json::{Value, json};
 use crate::process::{output, text};
 use crate::service::{get, poll_until, post, start};
 
-/// A recording of a car in a folder: frames of simulated drives, with a steering angle and a throttle of its own kind.
+/// A recording of a car in a folder, `car` as a data set: frames of simulated drives, with a steering angle and a throttle of its own kind.
 fn record_car(dir: &Path) {
     let arguments = "collect --scenario moving-observer --rooms varied --trials 12 --name drives";
     let collected = output(dir, &arguments.split(' ').collect::<Vec<_>>());
     assert!(collected.status.success(), "{}", text(&collected.stderr));
-    let drives = Dataset::open(&dir.join("data/datasets/drives")).unwrap();
-    std::fs::create_dir(dir.join("recorded")).unwrap();
-    let mut table = "timestamp,file,action.angle,action.throttle\n".to_owned();
-    for frame in 0..drives.info().frame_count {
-        let png = codec::encode_png(&drives.frame(frame).unwrap()).unwrap();
-        std::fs::write(dir.join(format!("recorded/{frame:04}.png")), png).unwrap();
-        let [linear, angular] = [drives.action(frame)[0], drives.action(frame)[1]];
-        let time_s = frame as f64 * 0.2;
-        writeln!(table, "{time_s:.1},{frame:04}.png,{},{}", -0.7 * angular, 2.0 * linear).unwrap();
-    }
-    std::fs::write(dir.join("recorded/car.csv"), table).unwrap();
+    write_recording(dir);
     let imported = output(
         dir,
         &["import", "recorded", "--csv", "recorded/car.csv", "--name", "car"],
     );
     assert!(imported.status.success(), "{}", text(&imported.stderr));
+}
+
+/// The frames of the data set `drives` as files, with a table of the car's actions and of where it is.
+fn write_recording(dir: &Path) {
+    let drives = Dataset::open(&dir.join("data/datasets/drives")).unwrap();
+    std::fs::create_dir(dir.join("recorded")).unwrap();
+    let mut table = "timestamp,file,action.angle,action.throttle,x,y,heading_cos,heading_sin\n".to_owned();
+    for frame in 0..drives.info().frame_count {
+        let png = codec::encode_png(&drives.frame(frame).unwrap()).unwrap();
+        std::fs::write(dir.join(format!("recorded/{frame:04}.png")), png).unwrap();
+        let [linear, angular] = [drives.action(frame)[0], drives.action(frame)[1]];
+        let [x, y, cos, sin] = *drives.state(frame).first_chunk().unwrap();
+        let (time_s, angle, throttle) = (frame as f64 * 0.2, -0.7 * angular, 2.0 * linear);
+        writeln!(
+            table,
+            "{time_s:.1},{frame:04}.png,{angle},{throttle},{x},{y},{cos},{sin}"
+        )
+        .unwrap();
+    }
+    std::fs::write(dir.join("recorded/car.csv"), table).unwrap();
 }
 
 /// That a command was refused with these words.
@@ -154,15 +164,38 @@ fn a_room_is_remembered_where_the_state_tells_the_pose() {
             .collect::<Vec<_>>(),
     );
     assert!(collected.status.success(), "{}", text(&collected.stderr));
+    write_recording(dir.path());
     let remembering = "train --from rooms --dataset drives --set sequence.steps=4 --set sequence.batch_size=2 \
         --set run.warmup_steps=0 --set model.flow.memory=true --out runs/home";
     let trained = run(&format!("{remembering} --set data.hidden=0 --set data.mirror=off"));
     assert!(trained.status.success(), "{}", text(&trained.stderr));
     let scored = run("evaluate --model runs/home/model --dataset drives --windows 6 --nearest-windows 40");
     assert!(scored.status.success(), "{}", text(&scored.stderr));
+    // A car's own actions, and where it is.
+    let poses = "--state x --state y --state heading_cos --state heading_sin";
+    for (name, actions) in [
+        ("placed", "--action action.angle --action action.throttle"),
+        ("places", ""),
+    ] {
+        let import = format!("import recorded --csv recorded/car.csv --name {name} {poses} {actions}");
+        let imported = output(dir.path(), &import.split_whitespace().collect::<Vec<_>>());
+        assert!(imported.status.success(), "{}", text(&imported.stderr));
+    }
+    let adapted = run(
+        "adapt placed --remember --name stays --steps 4 --set sequence.batch_size=2 --set run.warmup_steps=0 \
+         --set sequence.learning_rate=0.0003",
+    );
+    assert!(adapted.status.success(), "{}", text(&adapted.stderr));
+    let manifest = std::fs::read(dir.path().join("runs/stays/model/manifest.json")).unwrap();
+    let manifest: Value = serde_json::from_slice(&manifest).unwrap();
+    assert_eq!(manifest["spec"]["flow"]["memory"], true, "{manifest}");
     for (command, part) in [
         (remembering, "set data.mirror to off and data.hidden to 0"),
         ("adapt drives --name x --remember --mirror y", "cannot be used with"),
+        (
+            "adapt places --name x --remember",
+            "has no actions, so no room can be remembered",
+        ),
     ] {
         assert_refused(command, part, &run(command));
     }

@@ -9,6 +9,7 @@ mod error;
 mod input;
 mod local;
 mod meter;
+mod past_errors;
 mod prediction;
 mod predictor;
 mod queue;
@@ -23,6 +24,7 @@ pub use conditioning::{ConditioningInput, FieldNames, OBSERVATION_FIELDS, RawCon
 pub use error::{InputError, ServingError};
 pub use input::PredictionInput;
 pub use local::{Session, compute_task, predict};
+pub use past_errors::PastError;
 pub use prediction::{Prediction, Rollout, Timing};
 pub use predictor::{Predictor, PredictorConfig};
 pub use session::{SessionSnapshot, SessionState};

@@ -40,7 +40,7 @@ impl AdaptSettings {
     /// Updates, unless others are asked for.
     pub const STEPS: u32 = 1200;
 
-    /// Errors: `NoChannel`, `NoPose`, `Fixed`.
+    /// Errors: `NoChannel`, `NoPose`, `NoActions`, `Fixed`.
     fn check_channels(&self, info: &DatasetInfo) -> Result<(), AdaptError> {
         let states = info.state_channels.iter().map(|channel| channel.name.as_str());
         let states: Vec<&str> = states.collect();
@@ -60,6 +60,9 @@ impl AdaptSettings {
         }
         if self.remember && !POSE_CHANNELS.iter().all(|name| states.contains(name)) {
             return Err(AdaptError::NoPose(info.name.clone()));
+        }
+        if self.remember && info.action_channels.is_empty() {
+            return Err(AdaptError::NoActions(info.name.clone()));
         }
         Ok(())
     }

@@ -32,7 +32,8 @@ export function fits(model, dataset) {
 
 // The sources that a model can be offered: { id, label }.
 export function sourcesOf(model, datasets) {
-  const varied = estimatesDepth(model) ? [{ id: VARIED, label: "simulator, varied rooms" }] : [];
+  const knowsAnyRoom = estimatesDepth(model) && !model.spec.flow.memory;
+  const varied = knowsAnyRoom ? [{ id: VARIED, label: "simulator, varied rooms" }] : [];
   const simulator = fitsSimulator(model) ? [...varied, { id: "simulator", label: varied.length ? "simulator, one room" : "simulator" }] : [];
   const fitting = (datasets ?? []).filter(dataset => fits(model, dataset));
   return [...simulator, ...fitting.map(({ name }) => ({ id: `set:${name}`, label: `recorded: ${name}` }))];

@@ -128,8 +128,8 @@ function NewAdaptation({ models, datasets, submit }) {
   const dataset = datasets.find(({ name }) => name === form.dataset) ?? datasets.find(({ scenario }) => !scenario) ?? datasets[0];
   const from = form.from ?? models[0].name;
   const channels = [...new Set([...dataset.actions, ...dataset.states].map(({ name }) => name))];
-  const hasPose = POSE.every(channel => dataset.states.some(({ name }) => name === channel));
-  const remember = hasPose && Boolean(form.remember);
+  const canRemember = dataset.actions.length > 0 && POSE.every(channel => dataset.states.some(({ name }) => name === channel));
+  const remember = canRemember && Boolean(form.remember);
   const mirror = channels.filter(name => !remember && form.mirror.includes(name));
   const spec = { kind: "adapt", name: form.name || `${dataset.name}-adapted`, dataset: dataset.name, from, ...(form.steps && { steps: +form.steps }), ...(mirror.length && { mirror }), ...(remember && { remember }) };
   const set = name => event => setForm({ ...form, [name]: event.target.value });
@@ -139,7 +139,7 @@ function NewAdaptation({ models, datasets, submit }) {
       <label>Start from <select value=${from} onChange=${set("from")}>${models.map(({ name }) => html`<option value=${name}>${name}</option>`)}</select></label>
       <label>Name of the model <input value=${form.name} placeholder=${`${dataset.name}-adapted`} pattern="[a-z0-9][a-z0-9\\-]*" onInput=${set("name")} /></label>
       <label>Steps <input type="number" min="1" max="100000" value=${form.steps} placeholder="1200" onInput=${set("steps")} /></label>
-      ${hasPose && html`<fieldset class="wide"><legend>Stays in one room</legend><label><input type="checkbox" checked=${remember} onChange=${() => setForm({ ...form, remember: !remember })} /> remember it, by poses that always count from the same origin</label></fieldset>`}
+      ${canRemember && html`<fieldset class="wide"><legend>Stays in one room</legend><label><input type="checkbox" checked=${remember} onChange=${() => setForm({ ...form, remember: !remember })} /> remember it, by poses that always count from the same origin</label></fieldset>`}
       ${channels.length > 0 && !remember && html`<fieldset class="wide"><legend>Changes its sign in a mirror</legend>${channels.map(name => html`<label><input type="checkbox" checked=${mirror.includes(name)} onChange=${turn(name)} /> ${name}</label>`)}</fieldset>`}
     </div><p class="quiet">For the recording of a robot that drives: estimates its camera, then trains the model further, about five minutes on two cores. A model that became no better is not published. Mark all actions and states that say left or right, such as a steering angle; then half of the windows are mirrored.</p>
     <div class="actions"><button class="main">Adapt</button><${Copy} curl=${() => curl("POST", "/v1/jobs", spec)} python=${() => requests("POST", "/v1/jobs", spec)} /></div></form>`;

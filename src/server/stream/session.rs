@@ -194,7 +194,10 @@ impl Ownership {
             let core = &inner.core;
             let missing = core.missing_before(step.seq)?;
             let task = match missing {
-                Some(_) => Some(core.task(step.frame, &step.conditioning, step.is_overtaken, spec)),
+                Some(missing) => {
+                    let task = core.task(step.frame, &step.conditioning, step.is_overtaken, spec);
+                    Some(if missing > 0 { task.after_gap() } else { task })
+                }
                 None => core.repeat_task(spec),
             };
             (core.settings.format.unwrap_or(step.format), missing, task)
@@ -202,10 +205,8 @@ impl Ownership {
         let answer = if let Some(task) = task {
             let mut prediction = predictor.compute(model, task, Some(key)).await?;
             let core = &mut self.inner()?.core;
-            if missing.is_some()
-                && let Some(features) = prediction.features.pop()
-            {
-                core.state.advance(step.seq, features, step.conditioning, spec);
+            if missing.is_some() {
+                core.state.advance(step.seq, &mut prediction, step.conditioning, spec);
             }
             core.keep(step.timestamp_us, missing.unwrap_or(0), prediction)
         } else {

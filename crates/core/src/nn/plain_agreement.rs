@@ -192,6 +192,7 @@ fn assert_rollouts_agree(architecture: Architecture) {
     let known = conditioning(&spec);
     let camera_of = |row: usize| CameraModel {
         tilt_down_rad: 0.1 + 0.05 * row as f32,
+        height_m: Some(0.3 + 0.1 * row as f32),
         ..camera()
     };
     let conditioning = ConditioningTensors {
@@ -226,6 +227,7 @@ fn several_rollouts_of_a_window() {
         depth: true,
         ..FlowLayers::default()
     };
+    let remembering = FlowLayers { memory: true, ..depth };
     let dense = DenseSpec {
         features: 6,
         hidden: 5,
@@ -233,6 +235,7 @@ fn several_rollouts_of_a_window() {
     };
     for architecture in [
         flow(depth, Some(camera())),
+        flow(remembering, Some(camera())),
         flow(FlowLayers::default(), Some(camera())),
         Architecture::Dense(dense),
     ] {

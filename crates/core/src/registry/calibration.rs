@@ -113,7 +113,7 @@ impl Calibration {
         let features = state.and_then(|state| pose_features(spec, state));
         let at_pose = self.novelty.at_pose.as_ref().zip(features);
         let at_pose = at_pose.map_or(0.0, |(look, features)| look.distance(context, &features));
-        let read = spec.states_read_by_layers().into_iter();
+        let read = spec.states_that_count().into_iter();
         let of_state = read.filter_map(|channel| Some((self.states.get(channel)?, *state?.get(channel)?)));
         let of_actions = self.actions.iter().cycle().zip(actions.iter().copied());
         let excess = of_state.chain(of_actions).map(|(range, value)| range.excess(value));
@@ -181,6 +181,14 @@ pub struct ExpectedError {
     pub low: f32,
     /// The error is above it in 5 % of the cases.
     pub high: f32,
+}
+
+impl ExpectedError {
+    /// Errors that are larger by a factor; an MSE is at most 1.
+    pub(crate) fn times(self, factor: f32) -> Self {
+        let [mse, low, high] = [self.mse, self.low, self.high].map(|error| (error * factor).min(1.0));
+        Self { mse, low, high }
+    }
 }
 
 /// Measures how unlike the training data a context is: by the look of its last frame, by how much of the picture stands still,

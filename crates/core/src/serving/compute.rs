@@ -65,24 +65,27 @@ fn compute(loaded: &Model, tasks: &[&Task]) -> Result<Vec<Prediction>, Failure> 
         predictions.push(Prediction {
             manifest: Arc::clone(&loaded.manifest),
             features,
+            past_errors: task.past_errors.clone(),
             rollouts: Vec::new(),
             occupancy: None,
             warnings: Vec::new(),
             timing: Timing::default(),
         });
     }
-    if rows.is_empty() {
-        return Ok(predictions);
-    }
-    let windows = Windows::new(loaded, &windows, of_windows)?;
-    let mut rollouts = windows.predict(&rows)?.into_iter();
-    let mut window = 0;
-    for (task, prediction) in tasks.iter().zip(&mut predictions) {
-        if task.sees_occupancy && !task.conditioning_inputs.is_empty() {
-            prediction.occupancy = windows.occupancy(window)?;
+    if !rows.is_empty() {
+        let windows = Windows::new(loaded, &windows, of_windows)?;
+        let mut rollouts = windows.predict(&rows)?.into_iter();
+        let mut window = 0;
+        for (task, prediction) in tasks.iter().zip(&mut predictions) {
+            if task.sees_occupancy && !task.conditioning_inputs.is_empty() {
+                prediction.occupancy = windows.occupancy(window)?;
+            }
+            window += u32::from(!task.conditioning_inputs.is_empty());
+            prediction.rollouts = rollouts.by_ref().take(task.conditioning_inputs.len()).collect();
         }
-        window += u32::from(!task.conditioning_inputs.is_empty());
-        prediction.rollouts = rollouts.by_ref().take(task.conditioning_inputs.len()).collect();
+    }
+    for (task, prediction) in tasks.iter().zip(&mut predictions) {
+        prediction.follow_past_errors(&task.frames);
     }
     Ok(predictions)
 }

@@ -88,11 +88,9 @@ impl Session {
         check_size("frame", manifest, (frame.width(), frame.height()))?;
         let task = self.state.step(frame, Some(conditioning.clone()), &manifest.spec);
         let mut predictions = compute::run(&self.model, &[&task])?;
-        let prediction = predictions.pop().expect("a task without a prediction is a bug");
+        let mut prediction = predictions.pop().expect("a task without a prediction is a bug");
         let seq = self.state.next_seq();
-        for features in prediction.features {
-            self.state.advance(seq, features, conditioning.clone(), &manifest.spec);
-        }
+        self.state.advance(seq, &mut prediction, conditioning, &manifest.spec);
         Ok(prediction.rollouts.into_iter().next())
     }
 
@@ -194,13 +192,8 @@ mod tests {
         let (mut state, mut seen) = (SessionState::default(), Vec::new());
         for seq in 0..8u8 {
             let task = state.step(frame(seq, width), Some(conditioning(f32::from(seq))), spec);
-            let computed = compute::run(model, &[&task]).unwrap().remove(0);
-            state.advance(
-                u64::from(seq),
-                computed.features[0].clone(),
-                conditioning(f32::from(seq)),
-                spec,
-            );
+            let mut computed = compute::run(model, &[&task]).unwrap().remove(0);
+            state.advance(u64::from(seq), &mut computed, conditioning(f32::from(seq)), spec);
             seen.push(frame(seq, width));
             let Some(start) = seen.len().checked_sub(3) else {
                 assert!(computed.rollouts.is_empty());

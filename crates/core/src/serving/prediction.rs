@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 
+use super::past_errors::PastErrors;
 use super::task::Features;
 use crate::frame::Frame;
 use crate::nn::Occupancy;
@@ -19,6 +20,8 @@ pub struct Prediction {
     /// The features of the task's frames, in order.
     #[doc(hidden)]
     pub features: Vec<Features>,
+    /// The errors of the session, with its frame and this prediction.
+    pub(super) past_errors: PastErrors,
     /// One rollout for each conditioning input of the task, in order. A [`super::PredictionInput`] has one.
     pub rollouts: Vec<Rollout>,
     /// What stands around the robot, and where movers will be while it stops; `None` if the task did not ask, or the model
@@ -41,6 +44,19 @@ impl Prediction {
             return Vec::new();
         }
         (0..frames).map(|step| step >= horizon).collect()
+    }
+
+    /// Scales the expected errors by those of the session so far. `frames`: those of the task; in a session it is one.
+    pub(super) fn follow_past_errors(&mut self, frames: &[Frame]) {
+        if let [frame] = frames {
+            self.past_errors.observe(frame);
+        }
+        for rollout in &mut self.rollouts {
+            rollout.errors = self.past_errors.scaled(std::mem::take(&mut rollout.errors));
+        }
+        if let [_] = frames {
+            self.past_errors.expect(self.rollouts.first());
+        }
     }
 
     /// Adds the answer to the next part of the task.

@@ -17,7 +17,7 @@ pub(super) fn range_warnings(manifest: &Manifest, inputs: &[ConditioningInput]) 
     let actions: Vec<&[f32]> = actions.map(Action::as_slice).collect();
     let spec = &manifest.spec;
     // A pose that only says how the camera has moved may have any origin.
-    let read = spec.states_read_by_layers();
+    let read = spec.states_that_count();
     let all: Vec<usize> = (0..spec.actions.len()).collect();
     let mut warnings = warnings_of("state", (&spec.states, &read), &calibration.states, &states);
     warnings.extend(warnings_of(

@@ -7,6 +7,8 @@ use serde::{Deserialize, Serialize};
 
 use super::conditioning::{ConditioningInput, FieldNames, RawConditioning, check_states};
 use super::error::InputError;
+use super::past_errors::{PastError, PastErrors};
+use super::prediction::Prediction;
 use super::task::{Features, Task};
 use crate::frame::Frame;
 use crate::frame::warp::CameraModel;
@@ -64,6 +66,17 @@ pub enum SnapshotError {
         /// Frames given.
         frames: usize,
     },
+    /// More past errors than predicted steps, or numbers that no errors give.
+    #[error(
+        "snapshot.past_errors[{index}] is not possible: the model predicts {horizon} steps, a weight is 0 to 10, and a log_sum at most 7 \
+         times as large"
+    )]
+    PastError {
+        /// Which one.
+        index: usize,
+        /// Steps that the model predicts.
+        horizon: usize,
+    },
     /// The actions or the state do not fit the model.
     #[error("snapshot: {0}")]
     ConditioningInput(#[from] InputError),
@@ -94,6 +107,9 @@ pub struct SessionSnapshot {
     /// How many frames the last prediction had; absent: the model's horizon.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub steps: Option<usize>,
+    /// How large the errors of each predicted step were so far, compared with what was expected; absent if none is known.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub past_errors: Vec<PastError>,
 }
 
 /// The state of a session with one model.
@@ -107,6 +123,8 @@ pub struct SessionState {
     camera: Option<CameraModel>,
     /// The last one.
     pub(super) conditioning: ConditioningInput,
+    /// Those of its predictions.
+    past_errors: PastErrors,
 }
 
 impl SessionState {
@@ -145,6 +163,11 @@ impl SessionState {
                 frames,
             });
         }
+        let mut past_errors = snapshot.past_errors.iter().enumerate();
+        if let Some((index, _)) = past_errors.find(|(index, past)| *index >= spec.horizon || !past.is_possible()) {
+            let horizon = spec.horizon;
+            return Err(SnapshotError::PastError { index, horizon });
+        }
         let past_states = if spec.reads_past_states() {
             check_states(snapshot.past_states, manifest)?
         } else {
@@ -156,6 +179,7 @@ impl SessionState {
             next_seq: snapshot.next_seq,
             features: snapshot.features.into_iter().map(shrunk).collect(),
             conditioning,
+            past_errors: PastErrors::restored(snapshot.past_errors),
         })
     }
 
@@ -170,6 +194,7 @@ impl SessionState {
             past_states: self.past_states.iter().cloned().collect(),
             camera: self.camera,
             steps: self.conditioning.steps,
+            past_errors: self.past_errors.of_steps.clone(),
         }
     }
 
@@ -223,12 +248,21 @@ impl SessionState {
             frames: vec![frame],
             conditioning_inputs: conditioning.filter(|_| is_full).into_iter().collect(),
             sees_occupancy: false,
+            past_errors: self.past_errors.clone(),
         }
     }
 
-    /// Stores the result of the step of frame `seq`.
-    pub fn advance(&mut self, seq: u64, features: Features, conditioning: ConditioningInput, spec: &ModelSpec) {
-        self.features.push_back(features);
+    /// Takes the result of the step of frame `seq`.
+    pub fn advance(
+        &mut self,
+        seq: u64,
+        prediction: &mut Prediction,
+        conditioning: ConditioningInput,
+        spec: &ModelSpec,
+    ) {
+        self.features
+            .append(&mut std::mem::take(&mut prediction.features).into());
+        self.past_errors = std::mem::take(&mut prediction.past_errors);
         while self.features.len() > spec.context {
             self.features.pop_front();
         }
@@ -261,6 +295,7 @@ impl SessionState {
             frames: Vec::new(),
             conditioning_inputs,
             sees_occupancy: false,
+            past_errors: self.past_errors.so_far(),
         }
     }
 }
@@ -332,6 +367,7 @@ mod tests {
                 past_states: Vec::new(),
                 camera: None,
                 steps: None,
+                past_errors: Vec::new(),
             };
             let is_sound = snapshot.features.len() <= 3
                 && snapshot.features.iter().all(|f| f.len() == 5 && f.iter().all(|value| value.abs() <= 1.0))
@@ -360,6 +396,7 @@ mod tests {
             past_states: Vec::new(),
             camera: None,
             steps: None,
+            past_errors: Vec::new(),
         };
         snapshot.features[0][3] = f32::NAN;
         let error = SessionState::restore(snapshot, &model.manifest).unwrap_err();

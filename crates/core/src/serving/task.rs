@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use super::conditioning::{ConditioningInput, past_states_used};
 use super::error::InputError;
+use super::past_errors::PastErrors;
 use crate::frame::Frame;
 use crate::frame::warp::CameraModel;
 use crate::registry::Manifest;
@@ -29,6 +30,8 @@ pub struct Task {
     pub(super) warnings: Vec<String>,
     /// Whether the answer tells what stands around the robot. It takes the first rollout's state.
     pub(super) sees_occupancy: bool,
+    /// The errors of the session so far.
+    pub(super) past_errors: PastErrors,
 }
 
 impl Task {
@@ -64,6 +67,14 @@ impl Task {
         }
     }
 
+    /// The same task after a gap: its frame is not the one that was predicted.
+    #[doc(hidden)]
+    #[must_use]
+    pub fn after_gap(mut self) -> Self {
+        self.past_errors.skip();
+        self
+    }
+
     /// Splits off what is computed next: the frames, and the first rollouts up to a limit.
     pub(super) fn next_part(&mut self, limit: usize) -> Self {
         if self.conditioning_inputs.len() <= limit {
@@ -78,6 +89,7 @@ impl Task {
             conditioning_inputs: std::mem::replace(&mut self.conditioning_inputs, later),
             warnings: Vec::new(),
             sees_occupancy: std::mem::take(&mut self.sees_occupancy),
+            past_errors: self.past_errors.clone(),
         }
     }
 }

@@ -30,6 +30,11 @@ pub enum AdaptError {
         "data set \"{0}\" has no states x, y, heading_cos and heading_sin, so no room can be remembered: nothing says where the robot is in it"
     )]
     NoPose(String),
+    /// A room can be remembered only where actions say how the camera will move in it.
+    #[error(
+        "data set \"{0}\" has no actions, so no room can be remembered: nothing says where in it the camera will be"
+    )]
+    NoActions(String),
     /// A setting is fixed by the model to start from, or has a field of its own.
     #[error("{0} cannot be set for an adaptation: {1}")]
     Fixed(&'static str, &'static str),
@@ -55,6 +60,7 @@ impl HasErrorKind for AdaptError {
             Self::NotAdaptable(_)
             | Self::NoChannel { .. }
             | Self::NoPose(_)
+            | Self::NoActions(_)
             | Self::Fixed(..)
             | Self::NothingToJudge(_) => ErrorKind::Usage,
             Self::Settings(error) => error.kind(),

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .flow import FlowLayers, quarter_places
-from .geometry import Place, Turn, Vector, Viewer, centred, sample
+from .geometry import Camera, Place, Turn, Vector, Viewer, centred, sample
 from .graph import Graph, Tensor, Value, clip, concat, for_each_row, mean, where
 from .inputs import Inputs
 from .layers import block_mean, limited, shuffle, silu, unshuffle
@@ -19,28 +19,10 @@ _WALL_M, _FARTHER, _LEAST_SPREAD = 2.2, 1.25, 0.04
 _DEPTH_ROUNDS = 3
 
 
-class _Camera(NamedTuple):
-    """Field of view, tilt and height ``[rows, 1, 1, 1]``."""
-
-    horizontal_fov: Tensor
-    tilt_down: Tensor
-    height: Tensor
-
-    def viewer(self, shape: tuple[int, int]) -> Viewer:
-        return Viewer(self.horizontal_fov, self.tilt_down, shape)
-
-    def first_depth(self, viewer: Viewer) -> Value:
-        """Of each pixel, as if there were only the floor and a wall around the camera."""
-        rays = viewer.rays()
-        level = np.sqrt(rays.ahead * rays.ahead + rays.left * rays.left)
-        # Above the horizon, the floor is farther than any wall.
-        return np.minimum(_WALL_M / np.maximum(level, 1e-3), self.height / np.maximum(-rays.up, 1e-9))
-
-
 class _View(NamedTuple):
     """The last frames with what is known of them; of windows, or of their steps."""
 
-    camera: _Camera
+    camera: Camera
     frame: Tensor
     coarse: Tensor
     depth: Tensor
@@ -69,7 +51,7 @@ class DepthNetwork(FlowLayers):
         """All frames of the context in; the predicted frames, the last one's depth and the movers out."""
         frames, inputs = self.frames_input(graph), Inputs(graph, self.spec)
         given = graph.input("camera", ["batch", 3], "horizontal field of view (rad), tilt down (rad), height (m)")
-        camera = _Camera(*(given[:, part : part + 1].reshape(-1, 1, 1, 1) for part in range(3)))
+        camera = Camera(*(given[:, part : part + 1].reshape(-1, 1, 1, 1) for part in range(3)))
         level = mean(frames[0], [1, 2, 3])
         spread = np.maximum(np.sqrt(mean((frames[0] - level) * (frames[0] - level), [1, 2, 3])), _LEAST_SPREAD)
         levels = _Levels(level, spread)
@@ -79,7 +61,7 @@ class DepthNetwork(FlowLayers):
         motion = None if actions is None else Motion(self.spec, self.layers)(actions, inputs.state, state)
         modulation = self.modulation(range(self.horizon), state, actions, motion, view.frame)
         moved = for_each_row(np.zeros((1, self.horizon, 3)), view.frame) if motion is None else motion
-        remembered = self._remembered_ahead(inputs, moved.reshape(-1, 3, 1, 1), levels)
+        remembered = self._remembered_ahead(inputs, camera, moved.reshape(-1, 3, 1, 1), levels)
         drawn, z = self._steps(view, moved.reshape(-1, 3, 1, 1), modulation, remembered)
         drawn = drawn.reshape(-1, self.horizon, *self.shape)
         self.frames_output(graph, clip(drawn * spread + level, 0, 1))
@@ -90,10 +72,10 @@ class DepthNetwork(FlowLayers):
             about = "in the last frame and the next ones, logits: above 0 a pixel is more likely a mover's than not"
             graph.output("movers", movers, ["batch", 1 + self.horizon, *self.shape], about)
 
-    def _view(self, frames: list[Tensor], camera: _Camera, inputs: Inputs, levels: _Levels) -> _View:
+    def _view(self, frames: list[Tensor], camera: Camera, inputs: Inputs, levels: _Levels) -> _View:
         """The last frame, encoded with its depth from how the earlier ones differ."""
         viewer = camera.viewer(self.shape)
-        first_depth = camera.first_depth(viewer)
+        first_depth = _first_depth(viewer, camera.height)
         block_values = concat([*centred(self.half), block_mean(1 / first_depth)])
         blocks, shifts = [unshuffle(frames[0])], []
         for back, earlier in enumerate(frames[1:], 1):
@@ -103,7 +85,7 @@ class DepthNetwork(FlowLayers):
             shifts += shift
         seen = self.layers.conv3(concat([*blocks, *shifts, block_values]), "flow.stem")
         if self.room and inputs.state is not None:
-            now = self._counted(self.room.scene(self.room.pose_in(inputs.state)), levels)
+            now = self._counted(self.room.scene_by(camera, self.room.pose_in(inputs.state)), levels)
             seen = seen + self.layers.conv3(now[:, 8:], "flow.memory.seen")
         first = silu(seen)
         coarse = self.encoded(first)
@@ -115,13 +97,17 @@ class DepthNetwork(FlowLayers):
         """Features of the scene, then its content counted as the frames are."""
         return concat([scene[:, :8], (scene[:, 8:] - levels.mean) / levels.spread])
 
-    def _remembered_ahead(self, inputs: Inputs, motion: Tensor, levels: _Levels) -> Value:
+    def _remembered_ahead(self, inputs: Inputs, camera: Camera, motion: Tensor, levels: _Levels) -> Value:
         """What is remembered of the room at each step; None for a model without a memory."""
         if not self.room or inputs.state is None:
             return None
         before = self.room.pose_in(inputs.state).each(self.for_each_step)
         pose = before.moved(*(motion[:, part : part + 1] for part in range(3)))
-        return self._counted(self.room.scene(pose), _Levels(*(self.for_each_step(level, 1, 1, 1) for level in levels)))
+        levels = _Levels(*(self.for_each_step(level, 1, 1, 1) for level in levels))
+        return self._counted(self.room.scene_by(self._camera_ahead(camera), pose), levels)
+
+    def _camera_ahead(self, camera: Camera) -> Camera:
+        return Camera(*(self.for_each_step(number, 1, 1, 1) for number in camera))
 
     def _motion_back(self, inputs: Inputs, back: int) -> tuple[Turn, Value, Value]:
         """Where the camera stood at an earlier frame, as seen from the last one: turn, ahead, left."""
@@ -150,7 +136,7 @@ class DepthNetwork(FlowLayers):
     def _steps(self, view: _View, motion: Tensor, modulation: Tensor, remembered: Value) -> tuple[Tensor, Tensor]:
         """The frames of all steps at once, and their states. Each window has a row for each step."""
         rows = self.for_each_step
-        viewer = _Camera(*(rows(number, 1, 1, 1) for number in view.camera)).viewer(self.shape)
+        viewer = self._camera_ahead(view.camera).viewer(self.shape)
         last, depth = rows(view.frame, 1, *self.shape), rows(view.depth, 1, *self.shape)
         coarse, block_values = rows(view.coarse, self.channels, *self.quarter), rows(view.block_values, 3, *self.half)
         yaw, ahead, left = (motion[:, part : part + 1] for part in range(3))
@@ -173,3 +159,11 @@ class DepthNetwork(FlowLayers):
 
     def _movers(self, z: Tensor, name: str) -> Tensor:
         return shuffle(shuffle(self.layers.at_each_place(silu(z), "flow.movers." + name)))
+
+
+def _first_depth(viewer: Viewer, height: Value) -> Value:
+    """Of each pixel, as if there were only the floor and a wall around the camera."""
+    rays = viewer.rays()
+    level = np.sqrt(rays.ahead * rays.ahead + rays.left * rays.left)
+    # Above the horizon, the floor is farther than any wall.
+    return np.minimum(_WALL_M / np.maximum(level, 1e-3), height / np.maximum(-rays.up, 1e-9))

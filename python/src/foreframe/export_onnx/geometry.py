@@ -103,6 +103,17 @@ class Viewer:
         return self.project(self.rays().turned(Turn.by(yaw)))
 
 
+class Camera(NamedTuple):
+    """Field of view, tilt and height ``[rows, 1, 1, 1]``."""
+
+    horizontal_fov: Tensor
+    tilt_down: Tensor
+    height: Tensor
+
+    def viewer(self, shape: tuple[int, int]) -> Viewer:
+        return Viewer(self.horizontal_fov, self.tilt_down, shape)
+
+
 def sample(image: Tensor, place: Place, shape: tuple[int, int]) -> Tensor:
     """Bilinear, from an image of this shape; beyond the border, the border's pixel counts."""
     sides = zip(place, shape[::-1])

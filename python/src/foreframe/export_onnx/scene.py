@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .geometry import Place, Turn, Vector, Viewer, centred, on_rows
+from .geometry import Camera, Place, Turn, Vector, Viewer, centred, on_rows
 from .graph import Tensor, Value, concat, for_each_row, where
 from .layers import Layers, silu
 
@@ -68,8 +68,8 @@ class Room:
     def _viewer(self, shape: tuple[int, int]) -> Viewer:
         return Viewer(self.camera["horizontal_fov_rad"], self.camera["tilt_down_rad"], shape)
 
-    def _origin(self, pose: Pose) -> Vector:
-        return Vector((pose.x - self.middle.ahead) / self.unit, (pose.y - self.middle.left) / self.unit, 0.0)
+    def _origin(self, pose: Pose, above: Value = 0.0) -> Vector:
+        return Vector((pose.x - self.middle.ahead) / self.unit, (pose.y - self.middle.left) / self.unit, above / self.unit)
 
     def places(self, pose: Pose, before: Pose) -> Place:
         """Where the points that a camera sees from a pose were in its frame before."""
@@ -79,8 +79,17 @@ class Room:
         return viewer.project(points.plus(-there.ahead, -there.left).turned(before.heading.back()))
 
     def scene(self, pose: Pose) -> Value:
-        """12 channels on the half grid."""
-        x = self._described_rays(pose)
+        """12 channels on the half grid, for the camera by which the room was learned."""
+        return self._scene(self._viewer(self.half), pose, self._origin(pose))
+
+    def scene_by(self, camera: Camera, pose: Pose) -> Value:
+        """The same for another camera."""
+        height = self.camera.get("height_m")
+        above = 0.0 if height is None else camera.height - height
+        return self._scene(camera.viewer(self.half), pose, self._origin(pose, above))
+
+    def _scene(self, viewer: Viewer, pose: Pose, origin: Vector) -> Value:
+        x = self._described_rays(viewer, pose, origin)
         for index, name in enumerate(("inputs", "hidden", "output")):
             x = self.layers.at_each_place(silu(x) if index else x, "flow.scene." + name)
         return x + 0.5
@@ -102,17 +111,16 @@ class Room:
         points = Vector(*(start + time * direction for start, direction in zip(origin, directions)))
         return directions, points, sides_met, time
 
-    def _described_rays(self, pose: Pose) -> Tensor:
-        origin = self._origin(pose)
-        directions, points, sides_met, time = self._hits(origin, pose, self._viewer(self.half))
+    def _described_rays(self, viewer: Viewer, pose: Pose, origin: Vector) -> Tensor:
+        directions, points, sides_met, time = self._hits(origin, pose, viewer)
         met = concat(points)
         octaves = (np.pi / 4 * 2.0 ** np.arange(_POINT_OCTAVES)).reshape(1, 1, -1, 1, 1, 1)
         angles = met.reshape(-1, 3, 1, 1, *self.half) * octaves
         waves = concat([np.sin(angles), np.cos(angles)], axis=3).reshape(-1, 6 * _POINT_OCTAVES, *self.half)
-        rays = self._viewer(self.half).rays()
-        level = np.maximum(np.sqrt(rays.ahead**2 + rays.left**2), 1e-6)
+        rays = viewer.rays()
+        level = np.maximum(np.sqrt(rays.ahead * rays.ahead + rays.left * rays.left), 1e-6)
         x, y, z = (part / level for part in directions)
-        distance = time * np.sqrt(level**2 + rays.up**2)
+        distance = time * np.sqrt(level * level + rays.up * rays.up)
         everywhere = np.zeros((1, 1, *self.half))
         rest = [origin.ahead + everywhere, origin.left + everywhere, x, y, z, origin.ahead * y - origin.left * x]
         rest += [0.25 * distance, 0.05 * distance * distance, 1 / (distance + 0.3)]

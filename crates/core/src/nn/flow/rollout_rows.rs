@@ -60,7 +60,12 @@ impl<'a> RolloutRows<'a> {
             states,
             past_states,
         } = conditioning.values(spec, windows.len())?;
-        let cameras = conditioning.cameras.clone();
+        let estimates_depth = spec.flow().is_some_and(|flow| flow.layers.depth);
+        let cameras = if estimates_depth {
+            conditioning.cameras.clone()
+        } else {
+            Vec::new()
+        };
         if !(cameras.is_empty() || cameras.len() == windows.len()) {
             let message = format!("{} cameras do not fit {} rollouts", cameras.len(), windows.len());
             return Err(candle_core::Error::Msg(message).into());

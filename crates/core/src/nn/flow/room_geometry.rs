@@ -5,11 +5,14 @@
 #![allow(clippy::inline_always)]
 
 use std::ops::Range;
+use std::sync::Arc;
 
 use candle_core::{Result, Shape, Tensor};
 
+use crate::frame::warp::CameraModel;
 use crate::nn::fused::{FusedOperation, Operand, apply};
 use crate::nn::geometry::camera::{CameraPose, Viewer, rotated};
+use crate::nn::ops::sampling::ImageSize;
 use crate::nn::tensors::with_values;
 use crate::vectorized::vectorized;
 
@@ -92,31 +95,73 @@ impl RoomSides {
     }
 }
 
+/// From where a room is seen, and by which camera.
+#[derive(Clone)]
+pub(super) struct RoomView {
+    pub(super) pose: CameraPose,
+    /// How far the camera is above the height from which the room was learned, in metres.
+    pub(super) above: f32,
+    /// In the robot's axes; as many in all views.
+    pub(super) rays: Arc<Vec<[f32; 3]>>,
+}
+
+impl RoomView {
+    /// Views from these poses by these cameras. `learned_by`: the camera by which the room was learned.
+    pub(super) fn of(
+        poses: &[CameraPose],
+        cameras: &[CameraModel],
+        learned_by: CameraModel,
+        size: ImageSize,
+    ) -> Vec<Self> {
+        let mut views: Vec<Self> = Vec::with_capacity(poses.len());
+        for (index, (&pose, &camera)) in poses.iter().zip(cameras).enumerate() {
+            let before = index.checked_sub(1).filter(|&before| cameras[before] == camera);
+            views.push(Self {
+                pose,
+                above: above(camera, learned_by),
+                rays: before.map_or_else(
+                    || Arc::new(Viewer::new(camera, size).rays()),
+                    |before| Arc::clone(&views[before].rays),
+                ),
+            });
+        }
+        views
+    }
+}
+
+/// How far a camera is above another one, in metres; 0 where a height is not known.
+pub(super) fn above(camera: CameraModel, other: CameraModel) -> f32 {
+    let heights = camera.height_m.zip(other.height_m);
+    heights.map_or(0.0, |(own, other)| own - other)
+}
+
 /// Views of one room.
 #[derive(Clone)]
 pub(super) struct RoomViews {
     pub(super) scale: RoomScale,
-    /// The rays of a view in the robot's axes.
-    pub(super) rays: Vec<[f32; 3]>,
-    /// Where each view is taken from.
-    pub(super) poses: Vec<CameraPose>,
+    pub(super) views: Vec<RoomView>,
 }
 
 impl RoomViews {
+    /// Rays of all views.
+    fn rays(&self) -> usize {
+        self.views.iter().map(|view| view.rays.len()).sum()
+    }
+
     #[inline(always)]
-    fn origin(&self, pose: CameraPose) -> [f32; 3] {
+    fn origin(&self, pose: CameraPose, above: f32) -> [f32; 3] {
         let RoomScale { middle: [x, y], unit } = self.scale;
-        [(pose.x - x) / unit, (pose.y - y) / unit, 0.0]
+        [(pose.x - x) / unit, (pose.y - y) / unit, above / unit]
     }
 
     /// Calls `visit` with each ray in the room, views one after another, and the range of its description.
     #[inline(always)]
     fn visit(&self, mut visit: impl FnMut(Range<usize>, RoomRay)) {
         let mut from = 0;
-        for &pose in &self.poses {
-            let origin = self.origin(pose);
+        for RoomView { pose, above, rays } in &self.views {
+            let origin = self.origin(*pose, *above);
             let (sin, cos) = pose.heading.sin_cos();
-            for &ray in &self.rays {
+            for &ray in rays.iter() {
                 let direction = rotated(ray, sin, cos);
                 visit(from..from + RAY_VALUES, RoomRay { origin, direction });
                 from += RAY_VALUES;
@@ -132,16 +177,17 @@ impl RoomViews {
 
     /// Where each view's pixels were seen from the pose of the same index in `before`: `[views, rays, 2]`.
     pub(super) fn places_before(&self, sides: RoomSides, viewer: Viewer, before: &[CameraPose]) -> Vec<f32> {
-        let of_view = 2 * self.rays.len();
-        let mut places = vec![0.0; self.poses.len() * of_view];
-        let views = places.chunks_exact_mut(of_view).zip(&self.poses).zip(before);
-        for ((places, &pose), &from) in views {
-            let (origin, seen_from) = (self.origin(pose), self.origin(from));
+        let mut places = vec![0.0; 2 * self.rays()];
+        let mut rest = places.as_mut_slice();
+        for (RoomView { pose, above, rays }, from) in self.views.iter().zip(before) {
+            let (places, later) = rest.split_at_mut(2 * rays.len());
+            rest = later;
+            let [origin, seen_from] = [pose, from].map(|pose| self.origin(*pose, *above));
             let [(sin, cos), (sin_before, cos_before)] = [pose, from].map(|pose| pose.heading.sin_cos());
             vectorized(
                 #[inline(always)]
                 || {
-                    for (place, &ray) in places.chunks_exact_mut(2).zip(&self.rays) {
+                    for (place, &ray) in places.chunks_exact_mut(2).zip(rays.iter()) {
                         let direction = rotated(ray, sin, cos);
                         let hit = sides.hit(RoomRay { origin, direction });
                         let relative = std::array::from_fn(|axis| hit.point[axis] - seen_from[axis]);
@@ -189,7 +235,7 @@ impl FusedOperation<1> for RoomViews {
 
     fn forward(&self, [parameter]: [Operand; 1]) -> Result<(Vec<f32>, Shape)> {
         let sides = RoomSides::learned(parameter.values);
-        let rows = self.poses.len() * self.rays.len();
+        let rows = self.rays();
         let mut out = vec![0.0; rows * RAY_VALUES];
         self.visit(|range, ray| describe(ray, sides.hit(ray), &mut out[range]));
         Ok((out, Shape::from((rows, RAY_VALUES))))
@@ -238,28 +284,24 @@ fn side_gradient(ray: RoomRay, hit: RoomHit, y: &[f32], gradient: &[f32]) -> f32
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::frame::warp::CameraModel;
     use crate::nn::gradient_check::assert_gradients;
-    use crate::nn::ops::sampling::{ImageSize, own_places};
+    use crate::nn::ops::sampling::own_places;
 
-    fn views(viewer: Viewer, poses: &[CameraPose]) -> RoomViews {
+    const CAMERA: CameraModel = CameraModel {
+        horizontal_fov_rad: 1.0,
+        tilt_down_rad: 0.2,
+        height_m: Some(0.3),
+    };
+    const SIZE: ImageSize = ImageSize { height: 4, width: 6 };
+
+    fn views(cameras: &[CameraModel], poses: &[CameraPose]) -> RoomViews {
         RoomViews {
             scale: RoomScale {
                 middle: [2.0, 0.5],
                 unit: 0.8,
             },
-            rays: viewer.rays(),
-            poses: poses.to_vec(),
+            views: RoomView::of(poses, cameras, CAMERA, SIZE),
         }
-    }
-
-    fn viewer() -> Viewer {
-        let camera = CameraModel {
-            horizontal_fov_rad: 1.0,
-            tilt_down_rad: 0.2,
-            height_m: None,
-        };
-        Viewer::new(camera, ImageSize { height: 4, width: 6 })
     }
 
     #[test]
@@ -271,7 +313,7 @@ mod tests {
         });
         let parameter = Tensor::new(&[0.02f32, -0.03, 0.01, 0.05, 0.04, -0.02], &candle_core::Device::Cpu).unwrap();
         assert_gradients(&[parameter], 2e-4, |inputs| {
-            views(viewer(), &poses).describe(&inputs[0])
+            views(&[CAMERA; 3], &poses).describe(&inputs[0])
         });
     }
 
@@ -282,8 +324,45 @@ mod tests {
             y: 0.2,
             heading: 0.7,
         };
-        let places = views(viewer(), &[pose]).places_before(RoomSides::learned(&[0.0; 6]), viewer(), &[pose]);
-        let own = own_places(ImageSize { height: 4, width: 6 });
+        let viewer = Viewer::new(CAMERA, SIZE);
+        let places = views(&[CAMERA], &[pose]).places_before(RoomSides::learned(&[0.0; 6]), viewer, &[pose]);
+        let own = own_places(SIZE);
         assert!(places.iter().zip(own).all(|(a, b)| (a - b).abs() < 1e-3), "{places:?}");
+    }
+
+    #[test]
+    fn cameras_of_their_own_see_the_same_room() {
+        let pose = CameraPose {
+            x: 2.3,
+            y: 0.2,
+            heading: 0.7,
+        };
+        // The lower middle looks at the floor, `-0.8` units below the height of the camera by which it was learned.
+        let ray = 3 * SIZE.width + 3;
+        let met = |camera: CameraModel| {
+            let views = views(&[CAMERA, camera], &[pose, pose]);
+            let mut points = Vec::new();
+            views.visit(|_, ray| points.push(RoomSides::learned(&[0.0; 6]).hit(ray).point));
+            points[SIZE.pixels() + ray]
+        };
+        let down = |camera: CameraModel| CameraModel {
+            tilt_down_rad: 1.2,
+            ..camera
+        };
+        let [usual, higher] = [0.3, 0.7].map(|height| {
+            met(CameraModel {
+                height_m: Some(height),
+                ..down(CAMERA)
+            })
+        });
+        assert!(
+            (usual[2] + 0.8).abs() < 1e-5 && (higher[2] + 0.8).abs() < 1e-5,
+            "{usual:?} {higher:?}"
+        );
+        let from = [(2.3 - 2.0) / 0.8, (0.2 - 0.5) / 0.8];
+        let way = |point: [f32; 3]| (point[0] - from[0]).hypot(point[1] - from[1]);
+        // Half a unit higher, above 0.8, it sees the floor farther away in that proportion.
+        assert!((way(higher) / way(usual) - 1.3 / 0.8).abs() < 1e-4);
+        assert_ne!(met(CAMERA), usual);
     }
 }

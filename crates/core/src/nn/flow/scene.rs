@@ -9,7 +9,7 @@ use candle_core::{DType, Device, Tensor};
 use super::blocks::{centred, content_blocks};
 use super::encoder_views::EncoderViews;
 use super::rollout_rows::RolloutRows;
-use super::room_geometry::{RAY_VALUES, RoomScale, RoomSides, RoomViews};
+use super::room_geometry::{RAY_VALUES, RoomScale, RoomSides, RoomView, RoomViews};
 use crate::frame::warp::CameraModel;
 use crate::nn::error::NnError;
 use crate::nn::geometry::camera::{CameraPose, Viewer};
@@ -92,6 +92,8 @@ struct SceneViews<'a> {
     /// Yaw, ahead and left of each since the last frame `[M, 3]`.
     motion: Tensor,
     poses: &'a [CameraPose],
+    /// The camera of each, where it is known.
+    cameras: Vec<Option<CameraModel>>,
 }
 
 impl Scene {
@@ -129,6 +131,7 @@ impl Scene {
             states: row_of.iter().map(|&row| scaled[row].as_slice()).collect(),
             motion: motion.clone(),
             poses,
+            cameras: row_of.iter().map(|&row| rows.camera(row)).collect(),
         };
         self.seen(rows.spec, &views)
     }
@@ -141,6 +144,7 @@ impl Scene {
             states: scaled.iter().map(Vec::as_slice).collect(),
             motion: Tensor::zeros((contexts.count(), 3), DType::F32, &Device::Cpu)?,
             poses: &contexts.poses,
+            cameras: contexts.cameras.clone(),
         };
         let content = content_blocks(&self.seen(spec, &views)?)?;
         Ok(with_values(&content.detach(), <[f32]>::to_vec)?)
@@ -153,13 +157,12 @@ impl Scene {
         poses: &[CameraPose],
         before: &[CameraPose],
     ) -> Result<Option<Vec<f32>>, NnError> {
-        let SceneKind::Room(scale, _) = self.kind else {
+        let SceneKind::Room(scale, camera) = self.kind else {
             return Ok(None);
         };
         let views = RoomViews {
             scale,
-            rays: viewer.rays(),
-            poses: poses.to_vec(),
+            views: RoomView::of(poses, &vec![camera; poses.len()], camera, viewer.size()),
         };
         Ok(Some(views.places_before(RoomSides::of(&self.learned)?, viewer, before)))
     }
@@ -170,10 +173,10 @@ impl Scene {
         let image = || self.learned.reshape((1, half.height, half.width, SCENE_CHANNELS));
         Ok(match self.kind {
             SceneKind::Room(scale, camera) => {
+                let cameras: Vec<CameraModel> = views.cameras.iter().map(|own| own.unwrap_or(camera)).collect();
                 let views = RoomViews {
                     scale,
-                    rays: Viewer::new(camera, half).rays(),
-                    poses: views.poses.to_vec(),
+                    views: RoomView::of(views.poses, &cameras, camera, half),
                 };
                 let seen = perceptron(&self.layers, &views.describe(&self.learned)?)?;
                 (seen + MIDDLE_GRAY)?.reshape(shape)?

@@ -59,6 +59,11 @@ impl Viewer {
         }
     }
 
+    /// The size of its frames.
+    pub(in crate::nn) fn size(self) -> ImageSize {
+        self.size
+    }
+
     /// The ray of each pixel in the robot's axes, row by row; 1 long along the camera's axis.
     pub(in crate::nn) fn rays(self) -> Vec<[f32; 3]> {
         self.view.rays(self.size.width, self.size.height).collect()

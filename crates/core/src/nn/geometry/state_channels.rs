@@ -133,7 +133,15 @@ impl StateChannels {
 }
 
 impl ModelSpec {
-    /// The state's channels whose values count: all, but for the pose where it only says how the camera has moved.
+    /// The state's channels whose values count: all that layers read, and the pose where a memory finds its room by it.
+    pub(crate) fn states_that_count(&self) -> Vec<usize> {
+        if self.remembers_room() {
+            return (0..self.state_inputs().unwrap_or(0)).collect();
+        }
+        self.states_read_by_layers()
+    }
+
+    /// The state's channels that layers read: all, but for the pose in the depth form.
     pub(crate) fn states_read_by_layers(&self) -> Vec<usize> {
         let relative = StateChannels::of(self).pose.filter(|_| self.reads_past_states());
         (0..self.state_inputs().unwrap_or(0))
@@ -142,14 +150,15 @@ impl ModelSpec {
     }
 
     /// Where in its room the robot is: x and y in standard deviations of the training, and the heading in radians. `None` if
-    /// the model takes no pose, or reads only how poses differ.
+    /// the model takes no pose, or reads only how poses differ, or if the pose is not known.
     pub(crate) fn absolute_pose(&self, state: &[f32]) -> Option<[f32; 3]> {
         let channels = StateChannels::of(self);
         let [x, y, ..] = channels
             .pose
             .filter(|_| self.remembers_room() || !self.reads_past_states())?;
         let scaled = |channel: usize| self.states[channel].scaled(state[channel]);
-        (state.len() == self.states.len()).then(|| [scaled(x), scaled(y), channels.pose_in(state).heading])
+        let pose = (state.len() == self.states.len()).then(|| [scaled(x), scaled(y), channels.pose_in(state).heading]);
+        pose.filter(|pose| pose.iter().all(|part| part.is_finite()))
     }
 
     /// A state with its pose counted from another one's, as an odometry that started there has it. `None` where

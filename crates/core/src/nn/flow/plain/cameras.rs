@@ -42,6 +42,14 @@ impl Vectors {
             up: self.up.clone(),
         })
     }
+
+    /// Moved up by so much, `[M, 1]`.
+    pub(super) fn raised(&self, up: &Tensor) -> Result<Self> {
+        Ok(Self {
+            up: self.up.broadcast_add(up)?,
+            ..self.clone()
+        })
+    }
 }
 
 /// One camera for each of M items.

@@ -43,6 +43,7 @@ impl FlowNetwork {
             states: self.scaled_states(states)?,
             motion: &ahead.item_motion,
             poses: after,
+            cameras: None,
         };
         let seen = scene.plain_seen(&self.spec, &views)?;
         let coarse_places = self.plain_coarse_places(&ahead, &places)?;
@@ -104,6 +105,7 @@ impl FlowNetwork {
             states: self.scaled_states(contexts.states.iter().map(Vec::as_slice))?,
             motion: &Tensor::zeros((count, 3), candle_core::DType::F32, device)?,
             poses: self.room_poses(scene, &contexts.poses)?,
+            cameras: None,
         };
         inputs.push(content(&scene.plain_seen(&self.spec, &views)?)?.detach());
         inputs.push(centred_places(size.shrunk(2), count, device)?);

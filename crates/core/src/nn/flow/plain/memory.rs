@@ -7,10 +7,12 @@ use super::depth_views::SeenViews;
 use super::direct::content;
 use super::room::RoomPoses;
 use super::scene::SceneItems;
+use crate::frame::warp::CameraModel;
 use crate::nn::error::NnError;
 use crate::nn::flow::encoder_views::EncoderViews;
 use crate::nn::flow::memory::{Memory, Recalled, known_poses, mixed};
 use crate::nn::flow::rollout_rows::RolloutRows;
+use crate::nn::flow::room_geometry::above;
 use crate::nn::flow::scene::SceneKind;
 use crate::nn::geometry::camera::CameraPose;
 use crate::nn::ops::compose::SCENE_FEATURES;
@@ -22,10 +24,12 @@ impl Memory {
     pub(super) fn plain_now(&self, contexts: &EncoderViews, views: &SeenViews) -> Result<Tensor, NnError> {
         let (mut poses, device) = (contexts.poses.clone(), views.mean.device());
         let is_known = as_column(&known_poses(&mut poses), device)?;
+        let cameras = self.cameras(contexts.cameras.iter().copied());
         let items = SceneItems {
             states: None,
             motion: &Tensor::zeros((poses.len(), 3), DType::F32, device)?,
-            poses: self.poses(&poses, device)?,
+            poses: self.poses(&poses, &cameras, device)?,
+            cameras: Some(cameras),
         };
         let content = content(&self.scene.plain_seen(contexts.spec, &items)?)?.detach();
         let added = convolution(&self.seen, &counted(&content, &views.mean, &views.spread)?)?;
@@ -42,7 +46,8 @@ impl Memory {
         let mut poses: Vec<CameraPose> = ahead.row_of.iter().map(|&row| rows.pose(row)).collect();
         let device = views.mean.device();
         let is_known = as_column(&known_poses(&mut poses), device)?;
-        let before = self.poses(&poses, device)?;
+        let cameras = self.cameras(ahead.row_of.iter().map(|&row| rows.camera(row)));
+        let before = self.poses(&poses, &cameras, device)?;
         let after = match (self.scene.kind, before) {
             (SceneKind::Room(scale, _), Some(before)) => Some(before.moved(&ahead.item_motion.detach(), scale.unit)?),
             _ => None,
@@ -51,6 +56,7 @@ impl Memory {
             states: None,
             motion: &ahead.item_motion,
             poses: after,
+            cameras: Some(cameras),
         };
         let scene = self.scene.plain_seen(rows.spec, &items)?;
         let [mean, spread] = [ahead.of_contexts(&views.mean)?, ahead.of_contexts(&views.spread)?];
@@ -72,11 +78,21 @@ impl Memory {
         Ok(mixed(frames, &logits, &recalled.content, &recalled.is_known)?)
     }
 
-    fn poses(&self, poses: &[CameraPose], device: &Device) -> TensorResult<Option<RoomPoses>> {
-        match self.scene.kind {
-            SceneKind::Room(scale, _) => RoomPoses::of(scale, poses, device).map(Some),
-            _ => Ok(None),
-        }
+    fn poses(&self, poses: &[CameraPose], cameras: &[CameraModel], device: &Device) -> TensorResult<Option<RoomPoses>> {
+        let SceneKind::Room(scale, learned_by) = self.scene.kind else {
+            return Ok(None);
+        };
+        let above = cameras.iter().map(|&camera| above(camera, learned_by)).collect();
+        let poses = RoomPoses::of(scale, poses, device)?;
+        poses.raised(above, scale.unit).map(Some)
+    }
+
+    /// The cameras, those by which the room was learned where they are not known.
+    fn cameras(&self, known: impl Iterator<Item = Option<CameraModel>>) -> Vec<CameraModel> {
+        let SceneKind::Room(_, learned_by) = self.scene.kind else {
+            return Vec::new();
+        };
+        known.map(|camera| camera.unwrap_or(learned_by)).collect()
     }
 }
 

@@ -31,6 +31,7 @@ impl FlowNetwork {
             states: self.scaled_states((0..count).map(|row| rows.state(row)))?,
             motion: &once.item_motion,
             poses: None,
+            cameras: None,
         };
         let seen = scene.plain_seen(&self.spec, &views)?;
         let features = pixel_unshuffle(&seen.narrow(1, 0, SCENE_FEATURES)?)?;

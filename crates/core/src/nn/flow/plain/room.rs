@@ -11,10 +11,13 @@ use crate::nn::plain::sampling::{Places, at_least};
 pub(super) struct RoomPoses {
     x: Tensor,
     y: Tensor,
+    /// Above the height from which the room was learned.
+    z: Tensor,
     heading: Tensor,
 }
 
 impl RoomPoses {
+    /// Of cameras at the height from which the room was learned.
     pub(super) fn of(scale: RoomScale, poses: &[CameraPose], device: &Device) -> Result<Self> {
         let RoomScale { middle, unit } = scale;
         let part = |value: &dyn Fn(&CameraPose) -> f32| {
@@ -23,7 +26,17 @@ impl RoomPoses {
         Ok(Self {
             x: part(&|pose| (pose.x - middle[0]) / unit)?,
             y: part(&|pose| (pose.y - middle[1]) / unit)?,
+            z: part(&|_| 0.0)?,
             heading: part(&|pose| pose.heading)?,
+        })
+    }
+
+    /// So far above that height, in metres.
+    pub(super) fn raised(self, above: Vec<f32>, unit: f32) -> Result<Self> {
+        let above = Tensor::from_vec(above, self.z.shape(), self.z.device())?;
+        Ok(Self {
+            z: (above / f64::from(unit))?,
+            ..self
         })
     }
 
@@ -36,6 +49,7 @@ impl RoomPoses {
         Ok(Self {
             x: ((&self.x + (&cos * &ahead)?)? - (&sin * &left)?)?,
             y: ((&self.y + (sin * ahead)?)? + (cos * left)?)?,
+            z: self.z.clone(),
             heading: (&self.heading + part(0)?)?,
         })
     }
@@ -60,12 +74,11 @@ impl RayHits {
         let first = Tensor::new(&FIRST_SIDES, parameter.device())?;
         let sides = (first + (parameter * f64::from(SIDE_GAIN))?)?;
         let side = |index: usize| sides.narrow(0, index, 1)?.reshape((1, 1));
-        let floor = poses.x.zeros_like()?;
         let (mut times, mut highs) = (Vec::new(), Vec::new());
         let axes = [
             (&directions.ahead, &poses.x),
             (&directions.left, &poses.y),
-            (&directions.up, &floor),
+            (&directions.up, &poses.z),
         ];
         for (axis, (speed, origin)) in axes.into_iter().enumerate() {
             let high = speed.gt(0.0)?.to_dtype(DType::F32)?;
@@ -91,7 +104,7 @@ impl RayHits {
         }
         let times = at_least(&least, MIN_DISTANCE.into())?;
         Ok(Self {
-            points: directions.scaled(&times)?.moved(&poses.x, &poses.y)?,
+            points: directions.scaled(&times)?.moved(&poses.x, &poses.y)?.raised(&poses.z)?,
             directions,
             times,
             sides: met,
@@ -142,5 +155,6 @@ pub(super) fn describe(poses: &RoomPoses, cameras: &Cameras, parameter: &Tensor)
 pub(super) fn places_before([before, poses]: [&RoomPoses; 2], cameras: &Cameras, parameter: &Tensor) -> Result<Places> {
     let met = RayHits::new(poses, &cameras.rays()?, &parameter.detach())?;
     let relative = met.points.moved(&before.x.neg()?, &before.y.neg()?)?;
+    let relative = relative.raised(&before.z.neg()?)?;
     cameras.project(&relative.rotated(&before.heading.neg()?)?)
 }

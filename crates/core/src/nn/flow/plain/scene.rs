@@ -4,6 +4,7 @@ use candle_core::Tensor;
 
 use super::cameras::Cameras;
 use super::room::{RoomPoses, describe};
+use crate::frame::warp::CameraModel;
 use crate::nn::error::NnError;
 use crate::nn::flow::scene::{MIDDLE_GRAY, PLACE_VALUES, Scene, SceneKind, place_values};
 use crate::nn::ops::compose::SCENE_CHANNELS;
@@ -19,6 +20,8 @@ pub(super) struct SceneItems<'a> {
     pub(super) motion: &'a Tensor,
     /// Where the camera stands, where there is a room.
     pub(super) poses: Option<RoomPoses>,
+    /// The camera of each; the one by which the room was learned where they are `None`.
+    pub(super) cameras: Option<Vec<CameraModel>>,
 }
 
 impl Scene {
@@ -29,7 +32,9 @@ impl Scene {
         let image = || self.learned.unsqueeze(0);
         let seen = match (self.kind, &views.poses) {
             (SceneKind::Room(_, camera), Some(poses)) => {
-                let cameras = Cameras::new(&vec![camera; items], half, views.motion.device())?;
+                let own = views.cameras.clone();
+                let cameras = own.unwrap_or_else(|| vec![camera; items]);
+                let cameras = Cameras::new(&cameras, half, views.motion.device())?;
                 let met = describe(poses, &cameras, &self.learned)?;
                 perceptron(&self.layers, &met)?.reshape((items, blocks, SCENE_CHANNELS))?
             }

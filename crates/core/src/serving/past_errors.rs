@@ -1,0 +1,224 @@
+//! Expected errors that follow the errors made so far. A session compares each frame that arrives with what it had predicted of it,
+//! and scales what it expects of the next predictions as the past ones were off. So its bands also hold where the calibration,
+//! which knows only data like those of the training, expects too little.
+
+use std::collections::VecDeque;
+
+use serde::{Deserialize, Serialize};
+
+use super::prediction::Rollout;
+use crate::frame::Frame;
+use crate::registry::calibration::ExpectedError;
+
+/// Every so many pixels of a frame are compared, in both directions.
+const STRIDE: usize = 4;
+/// What an error counts for when the next one comes.
+const FADING: f32 = 0.9;
+/// For how many errors the calibration counts.
+const PRIOR: f32 = 1.0;
+/// Of the logarithm of an error over what was expected of it, at most.
+const MOST: f32 = 7.0;
+const LEAST_MSE: f32 = 1e-7;
+
+/// How large the errors of a predicted step were, over the middles of their bands. Both numbers fade with each new error.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
+#[serde(deny_unknown_fields)]
+pub struct PastError {
+    /// The sum of the natural logarithms of the errors over what was expected.
+    pub log_sum: f32,
+    /// How many errors that is: 0 for none, 10 for very many.
+    pub weight: f32,
+}
+
+impl PastError {
+    fn add(&mut self, log: f32) {
+        self.log_sum = FADING * self.log_sum + log.clamp(-MOST, MOST);
+        self.weight = FADING * self.weight + 1.0;
+    }
+
+    /// The mean of the logarithms, and of `before` as often as [`PRIOR`] says.
+    fn mean(self, before: f32) -> f32 {
+        (self.log_sum + PRIOR * before) / (self.weight + PRIOR)
+    }
+
+    /// Whether past errors can have led to these numbers.
+    pub(super) fn is_possible(self) -> bool {
+        (0.0..=1.0 / (1.0 - FADING) + 1e-3).contains(&self.weight) && self.log_sum.abs() <= MOST * self.weight + 1e-3
+    }
+}
+
+/// The errors of a session, and the predictions whose errors are still to come.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub(super) struct PastErrors {
+    /// Of each predicted step.
+    pub(super) of_steps: Vec<PastError>,
+    /// The predictions from the last frames, the latest first; empty for a frame without one.
+    pending: VecDeque<Vec<PendingFrame>>,
+}
+
+/// A predicted frame that did not arrive yet.
+#[derive(Clone, Debug, PartialEq)]
+struct PendingFrame {
+    pixels: Vec<u8>,
+    /// The middle of the band that the calibration gave.
+    expected: f32,
+}
+
+impl PastErrors {
+    /// Those of a session that goes on elsewhere.
+    pub(super) fn restored(of_steps: Vec<PastError>) -> Self {
+        Self {
+            of_steps,
+            pending: VecDeque::new(),
+        }
+    }
+
+    /// Compares a frame with what was predicted of it before.
+    pub(super) fn observe(&mut self, frame: &Frame) {
+        let arrived = sampled(frame);
+        for (step, predicted) in self.pending.iter().enumerate() {
+            let Some(predicted) = predicted.get(step) else { continue };
+            let error = mean_squared_difference(&predicted.pixels, &arrived).max(LEAST_MSE);
+            if self.of_steps.len() <= step {
+                self.of_steps.resize(step + 1, PastError::default());
+            }
+            self.of_steps[step].add((error / predicted.expected).ln());
+        }
+    }
+
+    /// The prediction that follows the last frame; `None` if there is none.
+    pub(super) fn expect(&mut self, rollout: Option<&Rollout>) {
+        let frames = rollout
+            .iter()
+            .flat_map(|rollout| rollout.frames.iter().zip(&rollout.errors));
+        let predicted = frames.zip(self.scales()).map(|((frame, error), scale)| PendingFrame {
+            pixels: sampled(frame),
+            expected: middle(error) / scale,
+        });
+        let predicted: Vec<PendingFrame> = predicted.collect();
+        let steps = predicted.len().max(self.of_steps.len());
+        self.pending.push_front(predicted);
+        self.pending.truncate(steps);
+    }
+
+    /// There is a gap before the next frame: what was predicted of it is another frame.
+    pub(super) fn skip(&mut self) {
+        self.pending.clear();
+    }
+
+    /// Without the predictions whose errors are still to come.
+    pub(super) fn so_far(&self) -> Self {
+        Self::restored(self.of_steps.clone())
+    }
+
+    /// Expected errors as the past ones make them.
+    pub(super) fn scaled(&self, errors: Vec<ExpectedError>) -> Vec<ExpectedError> {
+        let scaled = errors.into_iter().zip(self.scales());
+        scaled.map(|(error, scale)| error.times(scale)).collect()
+    }
+
+    /// By what the expected errors of each step are multiplied. A step of which little is known goes by the step before it, the first
+    /// one by the calibration.
+    fn scales(&self) -> impl Iterator<Item = f32> {
+        let known = self.of_steps.iter().copied();
+        known
+            .chain(std::iter::repeat(PastError::default()))
+            .scan(0.0, |mean, past| {
+                *mean = past.mean(*mean);
+                Some(mean.exp())
+            })
+    }
+}
+
+/// The middle of a band, as factors count.
+fn middle(error: &ExpectedError) -> f32 {
+    (error.low.max(LEAST_MSE) * error.high.max(LEAST_MSE)).sqrt()
+}
+
+fn sampled(frame: &Frame) -> Vec<u8> {
+    let rows = frame.pixels().chunks_exact(frame.width() as usize);
+    let rows = rows.skip(STRIDE / 2).step_by(STRIDE);
+    rows.flat_map(|row| row.iter().skip(STRIDE / 2).step_by(STRIDE))
+        .copied()
+        .collect()
+}
+
+fn mean_squared_difference(a: &[u8], b: &[u8]) -> f32 {
+    let squares = a.iter().zip(b).map(|(&a, &b)| u64::from(a.abs_diff(b)).pow(2));
+    squares.sum::<u64>() as f32 / (255.0 * 255.0 * a.len().max(1) as f32)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn frame(pixel: u8) -> Frame {
+        Frame::new(8, 8, vec![pixel; 64]).unwrap()
+    }
+
+    fn rollout(past: &PastErrors, pixel: u8) -> Rollout {
+        let error = ExpectedError {
+            mse: 0.012,
+            low: 0.005,
+            high: 0.02,
+        };
+        Rollout {
+            frames: vec![frame(pixel); 2],
+            errors: past.scaled(vec![error; 2]),
+            novelty: None,
+        }
+    }
+
+    /// After so many frames, of which each was predicted 51 gray levels (an MSE of 0.04) too dark.
+    fn after(frames: usize) -> PastErrors {
+        let mut past = PastErrors::default();
+        for _ in 0..frames {
+            past.observe(&frame(102));
+            let predicted = rollout(&past, 51);
+            past.expect(Some(&predicted));
+        }
+        past
+    }
+
+    #[test]
+    fn expected_errors_become_those_that_were_made() {
+        assert_eq!(rollout(&after(1), 0).errors[0].mse, 0.012);
+        let errors = rollout(&after(60), 0).errors;
+        for error in errors {
+            // The middle of the band comes near 0.04, from 0.01.
+            assert!((0.033..0.041).contains(&middle(&error)), "{error:?}");
+            assert!((error.mse / error.low - 0.012 / 0.005).abs() < 1e-3);
+        }
+        // The second step goes by the first one as long as nothing is known of it.
+        let [first, second] = rollout(&after(2), 0).errors[..] else {
+            panic!("two steps")
+        };
+        assert_eq!(first, second);
+        assert!(first.mse > 0.02);
+    }
+
+    #[test]
+    fn what_was_predicted_before_a_gap_is_no_error() {
+        let mut past = after(5);
+        let before = past.so_far();
+        past.skip();
+        past.observe(&frame(255));
+        assert_eq!(past.so_far(), before);
+        // A frame without a prediction keeps the places of the others.
+        let mut past = after(5);
+        past.observe(&frame(102));
+        past.expect(None);
+        past.observe(&frame(51));
+        assert_eq!(past.of_steps[0].weight, after(5).of_steps[0].weight * FADING + 1.0);
+        assert!(past.of_steps[1].log_sum < after(6).of_steps[1].log_sum);
+    }
+
+    #[test]
+    fn impossible_numbers_are_told_from_possible_ones() {
+        assert!(after(200).of_steps.iter().all(|past| past.is_possible()));
+        for [log_sum, weight] in [[0.0, -1.0], [0.0, 11.0], [8.0, 1.0], [f32::NAN, 1.0], [0.0, f32::NAN]] {
+            assert!(!PastError { log_sum, weight }.is_possible(), "{log_sum} {weight}");
+        }
+    }
+}
