@@ -25,24 +25,24 @@ fn record_car(dir: &Path) {
     assert!(imported.status.success(), "{}", text(&imported.stderr));
 }
 
-/// The frames of the data set `drives` as files, with a table of the car's actions and of where it is.
+/// The frames of the data set `drives` as files, with a table of the car's actions and of where it is, and one of where it is alone.
 fn write_recording(dir: &Path) {
     let drives = Dataset::open(&dir.join("data/datasets/drives")).unwrap();
     std::fs::create_dir(dir.join("recorded")).unwrap();
-    let mut table = "timestamp,file,action.angle,action.throttle,x,y,heading_cos,heading_sin\n".to_owned();
+    let mut actions = "timestamp,file,action.angle,action.throttle,x,y,heading_cos,heading_sin\n".to_owned();
+    let mut places = "timestamp,file,x,y,heading_cos,heading_sin\n".to_owned();
     for frame in 0..drives.info().frame_count {
         let png = codec::encode_png(&drives.frame(frame).unwrap()).unwrap();
         std::fs::write(dir.join(format!("recorded/{frame:04}.png")), png).unwrap();
         let [linear, angular] = [drives.action(frame)[0], drives.action(frame)[1]];
         let [x, y, cos, sin] = *drives.state(frame).first_chunk().unwrap();
         let (time_s, angle, throttle) = (frame as f64 * 0.2, -0.7 * angular, 2.0 * linear);
-        writeln!(
-            table,
-            "{time_s:.1},{frame:04}.png,{angle},{throttle},{x},{y},{cos},{sin}"
-        )
-        .unwrap();
+        let place = format!("{x},{y},{cos},{sin}");
+        writeln!(actions, "{time_s:.1},{frame:04}.png,{angle},{throttle},{place}").unwrap();
+        writeln!(places, "{time_s:.1},{frame:04}.png,{place}").unwrap();
     }
-    std::fs::write(dir.join("recorded/car.csv"), table).unwrap();
+    std::fs::write(dir.join("recorded/car.csv"), actions).unwrap();
+    std::fs::write(dir.join("recorded/places.csv"), places).unwrap();
 }
 
 /// That a command was refused with these words.
@@ -173,12 +173,9 @@ fn a_room_is_remembered_where_the_state_tells_the_pose() {
     assert!(scored.status.success(), "{}", text(&scored.stderr));
     // A car's own actions, and where it is.
     let poses = "--state x --state y --state heading_cos --state heading_sin";
-    for (name, actions) in [
-        ("placed", "--action action.angle --action action.throttle"),
-        ("places", ""),
-    ] {
-        let import = format!("import recorded --csv recorded/car.csv --name {name} {poses} {actions}");
-        let imported = output(dir.path(), &import.split_whitespace().collect::<Vec<_>>());
+    for (name, csv) in [("placed", "car"), ("places", "places")] {
+        let import = format!("import recorded --csv recorded/{csv}.csv --name {name} {poses}");
+        let imported = output(dir.path(), &import.split(' ').collect::<Vec<_>>());
         assert!(imported.status.success(), "{}", text(&imported.stderr));
     }
     let adapted = run(

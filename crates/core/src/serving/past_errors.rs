@@ -6,7 +6,6 @@ use std::collections::VecDeque;
 
 use serde::{Deserialize, Serialize};
 
-use super::prediction::Rollout;
 use crate::frame::Frame;
 use crate::registry::calibration::ExpectedError;
 
@@ -87,12 +86,10 @@ impl PastErrors {
         }
     }
 
-    /// The prediction that follows the last frame; `None` if there is none.
-    pub(super) fn expect(&mut self, rollout: Option<&Rollout>) {
-        let frames = rollout
-            .iter()
-            .flat_map(|rollout| rollout.frames.iter().zip(&rollout.errors));
-        let predicted = frames.zip(self.scales()).map(|((frame, error), scale)| PendingFrame {
+    /// Keeps the frames that were predicted from the last one, with their expected errors; none if nothing was predicted.
+    pub(super) fn keep(&mut self, frames: &[Frame], errors: &[ExpectedError]) {
+        let predicted = frames.iter().zip(errors).zip(self.scales());
+        let predicted = predicted.map(|((frame, error), scale)| PendingFrame {
             pixels: sampled(frame),
             expected: middle(error) / scale,
         });
@@ -157,17 +154,14 @@ mod tests {
         Frame::new(8, 8, vec![pixel; 64]).unwrap()
     }
 
-    fn rollout(past: &PastErrors, pixel: u8) -> Rollout {
+    /// Of two steps.
+    fn expected(past: &PastErrors) -> Vec<ExpectedError> {
         let error = ExpectedError {
             mse: 0.012,
             low: 0.005,
             high: 0.02,
         };
-        Rollout {
-            frames: vec![frame(pixel); 2],
-            errors: past.scaled(vec![error; 2]),
-            novelty: None,
-        }
+        past.scaled(vec![error; 2])
     }
 
     /// After so many frames, of which each was predicted 51 gray levels (an MSE of 0.04) too dark.
@@ -175,23 +169,22 @@ mod tests {
         let mut past = PastErrors::default();
         for _ in 0..frames {
             past.observe(&frame(102));
-            let predicted = rollout(&past, 51);
-            past.expect(Some(&predicted));
+            let errors = expected(&past);
+            past.keep(&[frame(51), frame(51)], &errors);
         }
         past
     }
 
     #[test]
     fn expected_errors_become_those_that_were_made() {
-        assert_eq!(rollout(&after(1), 0).errors[0].mse, 0.012);
-        let errors = rollout(&after(60), 0).errors;
-        for error in errors {
+        assert_eq!(expected(&after(1))[0].mse, 0.012);
+        for error in expected(&after(60)) {
             // The middle of the band comes near 0.04, from 0.01.
             assert!((0.033..0.041).contains(&middle(&error)), "{error:?}");
             assert!((error.mse / error.low - 0.012 / 0.005).abs() < 1e-3);
         }
         // The second step goes by the first one as long as nothing is known of it.
-        let [first, second] = rollout(&after(2), 0).errors[..] else {
+        let [first, second] = expected(&after(2))[..] else {
             panic!("two steps")
         };
         assert_eq!(first, second);
@@ -208,7 +201,7 @@ mod tests {
         // A frame without a prediction keeps the places of the others.
         let mut past = after(5);
         past.observe(&frame(102));
-        past.expect(None);
+        past.keep(&[], &[]);
         past.observe(&frame(51));
         assert_eq!(past.of_steps[0].weight, after(5).of_steps[0].weight * FADING + 1.0);
         assert!(past.of_steps[1].log_sum < after(6).of_steps[1].log_sum);

@@ -55,7 +55,10 @@ impl Prediction {
             rollout.errors = self.past_errors.scaled(std::mem::take(&mut rollout.errors));
         }
         if let [_] = frames {
-            self.past_errors.expect(self.rollouts.first());
+            let predicted = self.rollouts.first();
+            let predicted = predicted.map(|rollout| (rollout.frames.as_slice(), rollout.errors.as_slice()));
+            let (frames, errors) = predicted.unwrap_or_default();
+            self.past_errors.keep(frames, errors);
         }
     }
 

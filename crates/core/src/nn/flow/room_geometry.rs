@@ -97,7 +97,7 @@ impl RoomSides {
 
 /// From where a room is seen, and by which camera.
 #[derive(Clone)]
-pub(super) struct RoomView {
+pub(super) struct ViewInRoom {
     pub(super) pose: CameraPose,
     /// How far the camera is above the height from which the room was learned, in metres.
     pub(super) above: f32,
@@ -105,7 +105,7 @@ pub(super) struct RoomView {
     pub(super) rays: Arc<Vec<[f32; 3]>>,
 }
 
-impl RoomView {
+impl ViewInRoom {
     /// Views from these poses by these cameras. `learned_by`: the camera by which the room was learned.
     pub(super) fn of(
         poses: &[CameraPose],
@@ -139,7 +139,7 @@ pub(super) fn above(camera: CameraModel, other: CameraModel) -> f32 {
 #[derive(Clone)]
 pub(super) struct RoomViews {
     pub(super) scale: RoomScale,
-    pub(super) views: Vec<RoomView>,
+    pub(super) views: Vec<ViewInRoom>,
 }
 
 impl RoomViews {
@@ -158,7 +158,7 @@ impl RoomViews {
     #[inline(always)]
     fn visit(&self, mut visit: impl FnMut(Range<usize>, RoomRay)) {
         let mut from = 0;
-        for RoomView { pose, above, rays } in &self.views {
+        for ViewInRoom { pose, above, rays } in &self.views {
             let origin = self.origin(*pose, *above);
             let (sin, cos) = pose.heading.sin_cos();
             for &ray in rays.iter() {
@@ -179,7 +179,7 @@ impl RoomViews {
     pub(super) fn places_before(&self, sides: RoomSides, viewer: Viewer, before: &[CameraPose]) -> Vec<f32> {
         let mut places = vec![0.0; 2 * self.rays()];
         let mut rest = places.as_mut_slice();
-        for (RoomView { pose, above, rays }, from) in self.views.iter().zip(before) {
+        for (ViewInRoom { pose, above, rays }, from) in self.views.iter().zip(before) {
             let (places, later) = rest.split_at_mut(2 * rays.len());
             rest = later;
             let [origin, seen_from] = [pose, from].map(|pose| self.origin(*pose, *above));
@@ -300,7 +300,7 @@ mod tests {
                 middle: [2.0, 0.5],
                 unit: 0.8,
             },
-            views: RoomView::of(poses, cameras, CAMERA, SIZE),
+            views: ViewInRoom::of(poses, cameras, CAMERA, SIZE),
         }
     }
 

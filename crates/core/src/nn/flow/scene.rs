@@ -9,7 +9,7 @@ use candle_core::{DType, Device, Tensor};
 use super::blocks::{centred, content_blocks};
 use super::encoder_views::EncoderViews;
 use super::rollout_rows::RolloutRows;
-use super::room_geometry::{RAY_VALUES, RoomScale, RoomSides, RoomView, RoomViews};
+use super::room_geometry::{RAY_VALUES, RoomScale, RoomSides, RoomViews, ViewInRoom};
 use crate::frame::warp::CameraModel;
 use crate::nn::error::NnError;
 use crate::nn::geometry::camera::{CameraPose, Viewer};
@@ -162,7 +162,7 @@ impl Scene {
         };
         let views = RoomViews {
             scale,
-            views: RoomView::of(poses, &vec![camera; poses.len()], camera, viewer.size()),
+            views: ViewInRoom::of(poses, &vec![camera; poses.len()], camera, viewer.size()),
         };
         Ok(Some(views.places_before(RoomSides::of(&self.learned)?, viewer, before)))
     }
@@ -176,7 +176,7 @@ impl Scene {
                 let cameras: Vec<CameraModel> = views.cameras.iter().map(|own| own.unwrap_or(camera)).collect();
                 let views = RoomViews {
                     scale,
-                    views: RoomView::of(views.poses, &cameras, camera, half),
+                    views: ViewInRoom::of(views.poses, &cameras, camera, half),
                 };
                 let seen = perceptron(&self.layers, &views.describe(&self.learned)?)?;
                 (seen + MIDDLE_GRAY)?.reshape(shape)?
