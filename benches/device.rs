@@ -15,7 +15,15 @@ use foreframe_core::registry::{self, Model};
 #[global_allocator]
 static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 
-const MODELS: [&str; 7] = ["static", "moving", "static-flow", "donkeycar", "moving-flow", "rooms", "home"];
+const MODELS: [&str; 7] = [
+    "static",
+    "moving",
+    "static-flow",
+    "donkeycar",
+    "moving-flow",
+    "rooms",
+    "home",
+];
 const ROUNDS: usize = 5;
 const WINDOWS: usize = 64;
 const PLANS: usize = 256;
