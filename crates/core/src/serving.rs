@@ -24,7 +24,6 @@ pub use conditioning::{ConditioningInput, FieldNames, OBSERVATION_FIELDS, RawCon
 pub use error::{InputError, ServingError};
 pub use input::PredictionInput;
 pub use local::{Session, compute_task, predict};
-pub use past_errors::PastError;
 pub use prediction::{Prediction, Rollout, Timing};
 pub use predictor::{Predictor, PredictorConfig};
 pub use session::{SessionSnapshot, SessionState};

@@ -4,8 +4,6 @@
 
 use std::collections::VecDeque;
 
-use serde::{Deserialize, Serialize};
-
 use crate::frame::Frame;
 use crate::registry::calibration::ExpectedError;
 
@@ -20,14 +18,12 @@ const MOST: f32 = 7.0;
 const LEAST_MSE: f32 = 1e-7;
 
 /// How large the errors of a predicted step were, over the middles of their bands. Both numbers fade with each new error.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
-#[serde(deny_unknown_fields)]
-pub struct PastError {
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+struct PastError {
     /// The sum of the natural logarithms of the errors over what was expected.
-    pub log_sum: f32,
+    log_sum: f32,
     /// How many errors that is: 0 for none, 10 for very many.
-    pub weight: f32,
+    weight: f32,
 }
 
 impl PastError {
@@ -42,7 +38,7 @@ impl PastError {
     }
 
     /// Whether past errors can have led to these numbers.
-    pub(super) fn is_possible(self) -> bool {
+    fn is_possible(self) -> bool {
         (0.0..=1.0 / (1.0 - FADING) + 1e-3).contains(&self.weight) && self.log_sum.abs() <= MOST * self.weight + 1e-3
     }
 }
@@ -51,7 +47,7 @@ impl PastError {
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct PastErrors {
     /// Of each predicted step.
-    pub(super) of_steps: Vec<PastError>,
+    of_steps: Vec<PastError>,
     /// The predictions from the last frames, the latest first; empty for a frame without one.
     pending: VecDeque<Vec<PendingFrame>>,
 }
@@ -65,12 +61,23 @@ struct PendingFrame {
 }
 
 impl PastErrors {
-    /// Those of a session that goes on elsewhere.
-    pub(super) fn restored(of_steps: Vec<PastError>) -> Self {
-        Self {
+    /// Those of a session that goes on elsewhere. Errors: the index of numbers that no errors of so many steps give.
+    pub(super) fn restored(numbers: &[[f32; 2]], horizon: usize) -> Result<Self, usize> {
+        let numbers = numbers.iter().map(|&[log_sum, weight]| PastError { log_sum, weight });
+        let of_steps: Vec<PastError> = numbers.collect();
+        let mut indexed = of_steps.iter().enumerate();
+        if let Some((index, _)) = indexed.find(|(index, past)| *index >= horizon || !past.is_possible()) {
+            return Err(index);
+        }
+        Ok(Self {
             of_steps,
             pending: VecDeque::new(),
-        }
+        })
+    }
+
+    /// What [`Self::restored`] takes.
+    pub(super) fn numbers(&self) -> Vec<[f32; 2]> {
+        self.of_steps.iter().map(|past| [past.log_sum, past.weight]).collect()
     }
 
     /// Compares a frame with what was predicted of it before.
@@ -106,7 +113,10 @@ impl PastErrors {
 
     /// Without the predictions whose errors are still to come.
     pub(super) fn so_far(&self) -> Self {
-        Self::restored(self.of_steps.clone())
+        Self {
+            of_steps: self.of_steps.clone(),
+            pending: VecDeque::new(),
+        }
     }
 
     /// Expected errors as the past ones make them.
@@ -208,10 +218,12 @@ mod tests {
     }
 
     #[test]
-    fn impossible_numbers_are_told_from_possible_ones() {
-        assert!(after(200).of_steps.iter().all(|past| past.is_possible()));
-        for [log_sum, weight] in [[0.0, -1.0], [0.0, 11.0], [8.0, 1.0], [f32::NAN, 1.0], [0.0, f32::NAN]] {
-            assert!(!PastError { log_sum, weight }.is_possible(), "{log_sum} {weight}");
+    fn impossible_numbers_are_not_restored() {
+        let past = after(200);
+        assert_eq!(PastErrors::restored(&past.numbers(), 2), Ok(past.so_far()));
+        assert_eq!(PastErrors::restored(&past.numbers(), 1), Err(1));
+        for numbers in [[0.0, -1.0], [0.0, 11.0], [8.0, 1.0], [f32::NAN, 1.0], [0.0, f32::NAN]] {
+            assert_eq!(PastErrors::restored(&[[0.0; 2], numbers], 2), Err(1), "{numbers:?}");
         }
     }
 }

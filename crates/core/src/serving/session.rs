@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::conditioning::{ConditioningInput, FieldNames, RawConditioning, check_states};
 use super::error::InputError;
-use super::past_errors::{PastError, PastErrors};
+use super::past_errors::PastErrors;
 use super::prediction::Prediction;
 use super::task::{Features, Task};
 use crate::frame::Frame;
@@ -68,8 +68,8 @@ pub enum SnapshotError {
     },
     /// More past errors than predicted steps, or numbers that no errors give.
     #[error(
-        "snapshot.past_errors[{index}] is not possible: the model predicts {horizon} steps, a weight is 0 to 10, and a log_sum at most 7 \
-         times as large"
+        "snapshot.past_errors[{index}] is not possible: the model predicts {horizon} steps; of the two numbers of a step, the second is 0 to \
+         10, and the first at most 7 times as large"
     )]
     PastError {
         /// Which one.
@@ -107,9 +107,11 @@ pub struct SessionSnapshot {
     /// How many frames the last prediction had; absent: the model's horizon.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub steps: Option<usize>,
-    /// How large the errors of each predicted step were so far, compared with what was expected; absent if none is known.
+    /// Of each predicted step, how large its errors were so far: the sum of the natural logarithms of the errors over the middles of their
+    /// bands, and for how many errors it counts, 0 to 10. Both fade with each new error. Absent if no error is known.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    pub past_errors: Vec<PastError>,
+    #[cfg_attr(feature = "schema", schema(value_type = Vec<Vec<f32>>))]
+    pub past_errors: Vec<[f32; 2]>,
 }
 
 /// The state of a session with one model.
@@ -163,11 +165,9 @@ impl SessionState {
                 frames,
             });
         }
-        let mut past_errors = snapshot.past_errors.iter().enumerate();
-        if let Some((index, _)) = past_errors.find(|(index, past)| *index >= spec.horizon || !past.is_possible()) {
-            let horizon = spec.horizon;
-            return Err(SnapshotError::PastError { index, horizon });
-        }
+        let horizon = spec.horizon;
+        let past_errors = PastErrors::restored(&snapshot.past_errors, horizon)
+            .map_err(|index| SnapshotError::PastError { index, horizon })?;
         let past_states = if spec.reads_past_states() {
             check_states(snapshot.past_states, manifest)?
         } else {
@@ -179,7 +179,7 @@ impl SessionState {
             next_seq: snapshot.next_seq,
             features: snapshot.features.into_iter().map(shrunk).collect(),
             conditioning,
-            past_errors: PastErrors::restored(snapshot.past_errors),
+            past_errors,
         })
     }
 
@@ -194,7 +194,7 @@ impl SessionState {
             past_states: self.past_states.iter().cloned().collect(),
             camera: self.camera,
             steps: self.conditioning.steps,
-            past_errors: self.past_errors.of_steps.clone(),
+            past_errors: self.past_errors.numbers(),
         }
     }
 
