@@ -1,7 +1,7 @@
 //! Streams the episodes of a data set through a session, and prints how often the true errors were inside the 90 % bands that were
 //! predicted before: by the calibration alone, and as the session scales it by its own errors so far.
 //!
-//! `cargo run --release --example bands -- MODEL_DIR DATASET_DIR validation|test|all [without-actions]`
+//! `cargo run --release --example bands -- MODEL_DIR DATASET_DIR validation|test|all [frames-only]`
 
 use std::error::Error;
 use std::path::Path;
@@ -10,6 +10,8 @@ use std::sync::Arc;
 use foreframe::dataset::{Dataset, Split, Splits, Window, WindowShape};
 use foreframe::images::mse;
 use foreframe::{Action, ExpectedError, Frame, Model, RobotState, Rollout, Session, load};
+
+const USAGE: &str = "usage: bands MODEL_DIR DATASET_DIR validation|test|all [frames-only]";
 
 /// How many of the errors of each predicted step were inside.
 #[derive(Default)]
@@ -71,7 +73,7 @@ impl Source {
 fn main() -> Result<(), Box<dyn Error>> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let [model, dataset, part, rest @ ..] = arguments.as_slice() else {
-        return Err("usage: bands MODEL_DIR DATASET_DIR validation|test|all [without-actions]".into());
+        return Err(USAGE.into());
     };
     let (model, dataset) = (load(Path::new(model))?, Dataset::open(Path::new(dataset))?);
     let (split, splits) = match part.as_str() {
@@ -80,7 +82,13 @@ fn main() -> Result<(), Box<dyn Error>> {
             Splits::new(&dataset, model.manifest.dataset.split_seed),
         ),
         "test" => (Split::Test, Splits::new(&dataset, model.manifest.dataset.split_seed)),
-        _ => (Split::Test, Splits::all_for_test(&dataset)),
+        "all" => (Split::Test, Splits::all_for_test(&dataset)),
+        _ => return Err(USAGE.into()),
+    };
+    let knows_actions = match rest {
+        [] => true,
+        [only] if only == "frames-only" => false,
+        _ => return Err(USAGE.into()),
     };
     let shape = WindowShape {
         context: model.spec().context,
@@ -88,7 +96,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     };
     let windows = splits.windows(&dataset, split, shape, 1)?;
     let source = Source {
-        knows_actions: rest.is_empty(),
+        knows_actions,
         model: Arc::new(model),
         dataset,
     };

@@ -44,7 +44,7 @@ pub(super) struct AdaptArgs {
     #[arg(long, value_name = "CHANNEL")]
     mirror: Vec<String>,
     /// Also remember what the room of the recording looks like, for a robot that stays in it. Its states must have x, y, `heading_cos`
-    /// and `heading_sin`, always from the same origin
+    /// and `heading_sin`, always from the same origin, and the recording needs actions
     #[arg(long, conflicts_with = "mirror")]
     remember: bool,
     /// Another setting of the training, as in data.brightness=0; may be repeated

@@ -11,10 +11,14 @@ use crate::registry::calibration::ExpectedError;
 const STRIDE: usize = 4;
 /// What an error counts for when the next one comes.
 const FADING: f32 = 0.9;
-/// For how many errors the calibration counts.
+/// For how many errors the calibration counts at the first step, and each step's errors at the next one.
 const PRIOR: f32 = 1.0;
 /// Of the logarithm of an error over what was expected of it, at most.
 const MOST: f32 = 7.0;
+/// At least: where a camera hangs, nothing is to be expected of its next frames.
+const LEAST: f32 = -2.0;
+/// Steps that are compared; later ones go by the last of them.
+const STEPS: usize = 8;
 const LEAST_MSE: f32 = 1e-7;
 
 /// How large the errors of a predicted step were, over the middles of their bands. Both numbers fade with each new error.
@@ -28,7 +32,7 @@ struct PastError {
 
 impl PastError {
     fn add(&mut self, log: f32) {
-        self.log_sum = FADING * self.log_sum + log.clamp(-MOST, MOST);
+        self.log_sum = FADING * self.log_sum + log.clamp(LEAST, MOST);
         self.weight = FADING * self.weight + 1.0;
     }
 
@@ -83,6 +87,9 @@ impl PastErrors {
     /// Compares a frame with what was predicted of it before.
     pub(super) fn observe(&mut self, frame: &Frame) {
         let arrived = sampled(frame);
+        if arrived.is_empty() {
+            return;
+        }
         for (step, predicted) in self.pending.iter().enumerate() {
             let Some(predicted) = predicted.get(step) else { continue };
             let error = mean_squared_difference(&predicted.pixels, &arrived).max(LEAST_MSE);
@@ -93,17 +100,22 @@ impl PastErrors {
         }
     }
 
-    /// Keeps the frames that were predicted from the last one, with their expected errors; none if nothing was predicted.
+    /// Keeps the frames that were predicted from the last one, with the errors that the calibration expects; none if nothing was predicted.
     pub(super) fn keep(&mut self, frames: &[Frame], errors: &[ExpectedError]) {
-        let predicted = frames.iter().zip(errors).zip(self.scales());
-        let predicted = predicted.map(|((frame, error), scale)| PendingFrame {
+        let predicted = frames.iter().zip(errors).take(STEPS);
+        let predicted = predicted.map(|(frame, error)| PendingFrame {
             pixels: sampled(frame),
-            expected: middle(error) / scale,
+            expected: middle(error),
         });
-        let predicted: Vec<PendingFrame> = predicted.collect();
-        let steps = predicted.len().max(self.of_steps.len());
-        self.pending.push_front(predicted);
-        self.pending.truncate(steps);
+        self.pending.push_front(predicted.collect());
+        // Those of which every frame has arrived.
+        while self
+            .pending
+            .back()
+            .is_some_and(|oldest| oldest.len() < self.pending.len())
+        {
+            self.pending.pop_back();
+        }
     }
 
     /// There is a gap before the next frame: what was predicted of it is another frame.
@@ -164,14 +176,15 @@ mod tests {
         Frame::new(8, 8, vec![pixel; 64]).unwrap()
     }
 
+    const CALIBRATED: ExpectedError = ExpectedError {
+        mse: 0.012,
+        low: 0.005,
+        high: 0.02,
+    };
+
     /// Of two steps.
     fn expected(past: &PastErrors) -> Vec<ExpectedError> {
-        let error = ExpectedError {
-            mse: 0.012,
-            low: 0.005,
-            high: 0.02,
-        };
-        past.scaled(vec![error; 2])
+        past.scaled(vec![CALIBRATED; 2])
     }
 
     /// After so many frames, of which each was predicted 51 gray levels (an MSE of 0.04) too dark.
@@ -179,8 +192,7 @@ mod tests {
         let mut past = PastErrors::default();
         for _ in 0..frames {
             past.observe(&frame(102));
-            let errors = expected(&past);
-            past.keep(&[frame(51), frame(51)], &errors);
+            past.keep(&[frame(51), frame(51)], &[CALIBRATED; 2]);
         }
         past
     }
@@ -215,6 +227,29 @@ mod tests {
         past.observe(&frame(51));
         assert_eq!(past.of_steps[0].weight, after(5).of_steps[0].weight * FADING + 1.0);
         assert!(past.of_steps[1].log_sum < after(6).of_steps[1].log_sum);
+    }
+
+    #[test]
+    fn a_frame_without_a_prediction_does_not_hide_the_ones_before_it() {
+        let mut past = PastErrors::default();
+        for _ in 0..10 {
+            past.observe(&frame(102));
+            past.keep(&[frame(51), frame(51)], &[CALIBRATED; 2]);
+            past.observe(&frame(102));
+            past.keep(&[], &[]);
+        }
+        assert_eq!(past.numbers().len(), 2);
+        assert_eq!(past.pending.len(), 2);
+    }
+
+    #[test]
+    fn a_camera_that_hangs_does_not_close_the_bands() {
+        let mut past = PastErrors::default();
+        for _ in 0..200 {
+            past.observe(&frame(51));
+            past.keep(&[frame(51), frame(51)], &[CALIBRATED; 2]);
+        }
+        assert!(expected(&past).iter().all(|error| error.mse > 0.012 * 0.13));
     }
 
     #[test]

@@ -51,14 +51,14 @@ impl Prediction {
         if let [frame] = frames {
             self.past_errors.observe(frame);
         }
-        for rollout in &mut self.rollouts {
-            rollout.errors = self.past_errors.scaled(std::mem::take(&mut rollout.errors));
-        }
         if let [_] = frames {
             let predicted = self.rollouts.first();
             let predicted = predicted.map(|rollout| (rollout.frames.as_slice(), rollout.errors.as_slice()));
             let (frames, errors) = predicted.unwrap_or_default();
             self.past_errors.keep(frames, errors);
+        }
+        for rollout in &mut self.rollouts {
+            rollout.errors = self.past_errors.scaled(std::mem::take(&mut rollout.errors));
         }
     }
 

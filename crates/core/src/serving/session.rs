@@ -69,7 +69,7 @@ pub enum SnapshotError {
     /// More past errors than predicted steps, or numbers that no errors give.
     #[error(
         "snapshot.past_errors[{index}] is not possible: the model predicts {horizon} steps; of the two numbers of a step, the second is 0 to \
-         10, and the first at most 7 times as large"
+         10, and the first between -7 and 7 times the second"
     )]
     PastError {
         /// Which one.

@@ -43,7 +43,7 @@ pub struct AdaptSpec {
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub mirror: Vec<String>,
     /// Whether it also remembers what the room of the recording looks like, for a robot that stays in it. The states must have x, y,
-    /// `heading_cos` and `heading_sin`, always from the same origin, and `mirror` must be empty.
+    /// `heading_cos` and `heading_sin`, always from the same origin, there must be actions, and `mirror` must be empty.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub remember: bool,
     /// Other settings of the training.
