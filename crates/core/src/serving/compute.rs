@@ -238,8 +238,7 @@ impl<'a> Windows<'a> {
     /// The camera of each row; empty where the model's counts.
     fn cameras(&self, window_of: &[u32]) -> Vec<CameraModel> {
         let flow = self.loaded.spec().flow();
-        let Some(flow) = flow.filter(|flow| flow.layers.depth && self.tasks.iter().any(|task| task.camera.is_some()))
-        else {
+        let Some(flow) = flow.filter(|_| self.tasks.iter().any(|task| task.camera.is_some())) else {
             return Vec::new();
         };
         let of_row = |&window: &u32| self.tasks[window as usize].camera.or(flow.camera);

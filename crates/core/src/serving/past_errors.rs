@@ -100,7 +100,8 @@ impl PastErrors {
         }
     }
 
-    /// Keeps the frames that were predicted from the last one, with the errors that the calibration expects; none if nothing was predicted.
+    /// Keeps the frames that were predicted from the last one, with the errors that the calibration expects; none if nothing was
+    /// predicted.
     pub(super) fn keep(&mut self, frames: &[Frame], errors: &[ExpectedError]) {
         let predicted = frames.iter().zip(errors).take(STEPS);
         let predicted = predicted.map(|(frame, error)| PendingFrame {
@@ -189,9 +190,14 @@ mod tests {
 
     /// After so many frames, of which each was predicted 51 gray levels (an MSE of 0.04) too dark.
     fn after(frames: usize) -> PastErrors {
+        after_frames_of(frames, 102)
+    }
+
+    /// After so many frames of one gray, where 51 was predicted.
+    fn after_frames_of(frames: usize, pixel: u8) -> PastErrors {
         let mut past = PastErrors::default();
         for _ in 0..frames {
-            past.observe(&frame(102));
+            past.observe(&frame(pixel));
             past.keep(&[frame(51), frame(51)], &[CALIBRATED; 2]);
         }
         past
@@ -244,12 +250,11 @@ mod tests {
 
     #[test]
     fn a_camera_that_hangs_does_not_close_the_bands() {
-        let mut past = PastErrors::default();
-        for _ in 0..200 {
-            past.observe(&frame(51));
-            past.keep(&[frame(51), frame(51)], &[CALIBRATED; 2]);
-        }
-        assert!(expected(&past).iter().all(|error| error.mse > 0.012 * 0.13));
+        assert!(
+            expected(&after_frames_of(200, 51))
+                .iter()
+                .all(|error| error.mse > 0.012 * 0.13)
+        );
     }
 
     #[test]

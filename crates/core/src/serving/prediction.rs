@@ -50,8 +50,6 @@ impl Prediction {
     pub(super) fn follow_past_errors(&mut self, frames: &[Frame]) {
         if let [frame] = frames {
             self.past_errors.observe(frame);
-        }
-        if let [_] = frames {
             let predicted = self.rollouts.first();
             let predicted = predicted.map(|rollout| (rollout.frames.as_slice(), rollout.errors.as_slice()));
             let (frames, errors) = predicted.unwrap_or_default();

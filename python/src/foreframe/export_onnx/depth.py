@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .flow import FlowLayers, quarter_places
-from .geometry import Camera, Place, Turn, Vector, Viewer, centred, sample
+from .geometry import CameraInput, Place, Turn, Vector, Viewer, centred, sample
 from .graph import Graph, Tensor, Value, clip, concat, for_each_row, mean, where
 from .inputs import Inputs
 from .layers import block_mean, limited, shuffle, silu, unshuffle
@@ -22,7 +22,7 @@ _DEPTH_ROUNDS = 3
 class _View(NamedTuple):
     """The last frames with what is known of them; of windows, or of their steps."""
 
-    camera: Camera
+    camera: CameraInput
     frame: Tensor
     coarse: Tensor
     depth: Tensor
@@ -51,7 +51,7 @@ class DepthNetwork(FlowLayers):
         """All frames of the context in; the predicted frames, the last one's depth and the movers out."""
         frames, inputs = self.frames_input(graph), Inputs(graph, self.spec)
         given = graph.input("camera", ["batch", 3], "horizontal field of view (rad), tilt down (rad), height (m)")
-        camera = Camera(*(given[:, part : part + 1].reshape(-1, 1, 1, 1) for part in range(3)))
+        camera = CameraInput(*(given[:, part : part + 1].reshape(-1, 1, 1, 1) for part in range(3)))
         level = mean(frames[0], [1, 2, 3])
         spread = np.maximum(np.sqrt(mean((frames[0] - level) * (frames[0] - level), [1, 2, 3])), _LEAST_SPREAD)
         levels = _Levels(level, spread)
@@ -72,7 +72,7 @@ class DepthNetwork(FlowLayers):
             about = "in the last frame and the next ones, logits: above 0 a pixel is more likely a mover's than not"
             graph.output("movers", movers, ["batch", 1 + self.horizon, *self.shape], about)
 
-    def _view(self, frames: list[Tensor], camera: Camera, inputs: Inputs, levels: _Levels) -> _View:
+    def _view(self, frames: list[Tensor], camera: CameraInput, inputs: Inputs, levels: _Levels) -> _View:
         """The last frame, encoded with its depth from how the earlier ones differ."""
         viewer = camera.viewer(self.shape)
         first_depth = _first_depth(viewer, camera.height)
@@ -97,7 +97,7 @@ class DepthNetwork(FlowLayers):
         """Features of the scene, then its content counted as the frames are."""
         return concat([scene[:, :8], (scene[:, 8:] - levels.mean) / levels.spread])
 
-    def _remembered_ahead(self, inputs: Inputs, camera: Camera, motion: Tensor, levels: _Levels) -> Value:
+    def _remembered_ahead(self, inputs: Inputs, camera: CameraInput, motion: Tensor, levels: _Levels) -> Value:
         """What is remembered of the room at each step; None for a model without a memory."""
         if not self.room or inputs.state is None:
             return None
@@ -106,8 +106,8 @@ class DepthNetwork(FlowLayers):
         levels = _Levels(*(self.for_each_step(level, 1, 1, 1) for level in levels))
         return self._counted(self.room.scene_by(self._camera_ahead(camera), pose), levels)
 
-    def _camera_ahead(self, camera: Camera) -> Camera:
-        return Camera(*(self.for_each_step(number, 1, 1, 1) for number in camera))
+    def _camera_ahead(self, camera: CameraInput) -> CameraInput:
+        return CameraInput(*(self.for_each_step(number, 1, 1, 1) for number in camera))
 
     def _motion_back(self, inputs: Inputs, back: int) -> tuple[Turn, Value, Value]:
         """Where the camera stood at an earlier frame, as seen from the last one: turn, ahead, left."""

@@ -103,7 +103,7 @@ class Viewer:
         return self.project(self.rays().turned(Turn.by(yaw)))
 
 
-class Camera(NamedTuple):
+class CameraInput(NamedTuple):
     """Field of view, tilt and height ``[rows, 1, 1, 1]``."""
 
     horizontal_fov: Tensor

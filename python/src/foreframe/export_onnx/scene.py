@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .geometry import Camera, Place, Turn, Vector, Viewer, centred, on_rows
+from .geometry import CameraInput, Place, Turn, Vector, Viewer, centred, on_rows
 from .graph import Tensor, Value, concat, for_each_row, where
 from .layers import Layers, silu
 
@@ -82,7 +82,7 @@ class Room:
         """12 channels on the half grid, for the camera by which the room was learned."""
         return self._scene(self._viewer(self.half), pose, self._origin(pose))
 
-    def scene_by(self, camera: Camera, pose: Pose) -> Value:
+    def scene_by(self, camera: CameraInput, pose: Pose) -> Value:
         """The same for another camera."""
         height = self.camera.get("height_m")
         above = 0.0 if height is None else camera.height - height
