@@ -10,9 +10,10 @@ use super::process::{command_line, print_line};
 use super::settings::DirectoryArgs;
 use super::train::OneTraining;
 use super::workspace::Workspace;
+use foreframe_core::error_kind::{ErrorKind, HasErrorKind as _};
 use foreframe_core::registry;
 use foreframe_core::types::{ModelName, ValueError};
-use foreframe_train::adaptation::{AdaptSettings, Adaptation};
+use foreframe_train::adaptation::{AdaptError, AdaptSettings, Adaptation};
 use foreframe_train::settings::SettingsLayer;
 
 /// Adapt a model that sees depth to a robot of your own, from a few minutes of recording.
@@ -63,7 +64,8 @@ pub(super) fn run(args: &AdaptArgs) -> Result<(), CliError> {
     let start = workspace.load_weights(&args.from)?;
     let (directory, dataset) = workspace.open_dataset(&args.dataset)?;
     let settings = settings(args, &dataset.info().name)?;
-    let adaptation = Adaptation::of(&base, dataset, &settings)?;
+    let cancelled = interrupt::flag()?;
+    let adaptation = Adaptation::of(&base, dataset, &settings, &cancelled).map_err(not_begun)?;
     if let Some(camera) = &adaptation.camera {
         print_line(format!(
             "camera, {camera}; import with --fov and --tilt if you know better"
@@ -71,7 +73,7 @@ pub(super) fn run(args: &AdaptArgs) -> Result<(), CliError> {
     }
     let config = &adaptation.config;
     let run_dir = (args.out.clone()).unwrap_or_else(|| PathBuf::from("runs").join(config.name.as_str()));
-    let (command, cancelled) = (command_line(), interrupt::flag()?);
+    let command = command_line();
     let training = OneTraining {
         dataset: &adaptation.dataset,
         command: &command,
@@ -95,6 +97,14 @@ pub(super) fn run(args: &AdaptArgs) -> Result<(), CliError> {
         shell_path(&directory),
         shell_path(&run_dir),
     ))
+}
+
+/// The training did not begin, or was interrupted before it began, which is no failure.
+fn not_begun(error: AdaptError) -> CliError {
+    match error.kind() {
+        ErrorKind::Cancelled => CliError::Interrupted("stopped before the training; nothing was written".to_owned()),
+        _ => error.into(),
+    }
 }
 
 /// What the arguments say, for a data set of that name.

@@ -3,12 +3,17 @@
 use std::fmt::Write as _;
 use std::path::Path;
 use std::process::Output;
+use std::sync::atomic::AtomicBool;
 
 use foreframe::server::ServerConfig;
 use foreframe_core::frame::codec;
+use foreframe_core::nn::Conditioning;
 use foreframe_data::dataset::Dataset;
+use foreframe_train::evaluation::{self, EvaluationError};
 use serde_json::{Value, json};
 
+use crate::evaluation::{SIDE, spec, untrained};
+use crate::fixtures::moving_squares;
 use crate::process::{output, text};
 use crate::service::{get, poll_until, post, start};
 
@@ -150,6 +155,18 @@ fn rooms_is_scored_on_a_car_and_adapted_to_it_unless_it_gets_worse() {
 }
 
 #[test]
+fn a_set_flag_ends_the_estimate_of_the_camera() {
+    let dataset = moving_squares(30, SIDE, 0.2);
+    let model = untrained("still", spec(Conditioning::None), &dataset);
+    let estimated = |is_cancelled: bool| {
+        let cancelled = AtomicBool::new(is_cancelled);
+        evaluation::estimate_camera(&model, &dataset, 0.6, 0.0, &cancelled)
+    };
+    assert!(estimated(false).unwrap().is_some());
+    assert!(matches!(estimated(true), Err(EvaluationError::Cancelled)));
+}
+
+#[test]
 fn a_room_is_remembered_where_the_state_tells_the_pose() {
     let dir = tempfile::tempdir().unwrap();
     let models = Path::new(env!("CARGO_MANIFEST_DIR")).join("models");
@@ -215,18 +232,20 @@ async fn a_job_adapts_rooms_and_publishes_the_model_unless_it_gets_worse() {
         });
         json!({"kind": "adapt", "name": name, "dataset": "car", "steps": 4, "mirror": ["action.angle"], "settings": settings})
     };
-    let ended = async |body: &Value| {
-        let taken = post(&app, "/v1/jobs", body).await;
-        assert_eq!(taken.status, 202, "{}", taken.json());
-        let path = format!("/v1/jobs/{}", taken.json()["id"].as_str().unwrap());
+    let end_of = async |path: &str| {
         poll_until(async || {
-            let job = get(&app, &path).await.json();
+            let job = get(&app, path).await.json();
             ["succeeded", "failed"]
                 .iter()
                 .any(|state| job["state"] == *state)
                 .then_some(job)
         })
         .await
+    };
+    let ended = async |body: &Value| {
+        let taken = post(&app, "/v1/jobs", body).await;
+        assert_eq!(taken.status, 202, "{}", taken.json());
+        end_of(&format!("/v1/jobs/{}", taken.json()["id"].as_str().unwrap())).await
     };
     let better = ended(&adapt("mycar", 0.0003)).await;
     assert_eq!(
@@ -256,6 +275,18 @@ async fn a_job_adapts_rooms_and_publishes_the_model_unless_it_gets_worse() {
         "{worse}"
     );
     assert_eq!(get(&app, "/v1/models/worse").await.status, 404);
+
+    // A resumed job starts from the same version, though another one is active now.
+    assert_eq!(worse["spec"]["from_version"], 1, "{worse}");
+    let newer = ended(&adapt("rooms", 0.0003)).await;
+    assert_eq!(newer["result"]["version"], 2, "{newer}");
+    let activated = post(&app, "/v1/models/rooms/versions/2/activate", &Value::Null).await;
+    assert_eq!(activated.json()["active_version"], 2);
+    let path = format!("/v1/jobs/{}", worse["id"].as_str().unwrap());
+    post(&app, &format!("{path}/resume"), &Value::Null).await;
+    let again = end_of(&path).await;
+    assert_eq!((&again["attempts"], &again["error"]), (&json!(2), &worse["error"]));
+    assert_eq!(again["spec"], worse["spec"]);
 
     let refused = async |field: &str, value: Value| {
         let mut body = adapt("x", 0.001);

@@ -1,9 +1,11 @@
 //! Expected errors, novelty, warnings and other numbers of steps: from the calibration to the answers.
 
+use std::ops::Range;
 use std::sync::Arc;
 use std::time::Instant;
 
-use foreframe::server::ServerConfig;
+use foreframe::server::protocol::{ClientMessage, Codec, FrameMessage, ServerMessage};
+use foreframe::server::{ImageBytes, ServerConfig};
 use foreframe_core::nn::ModelSpec;
 use foreframe_core::registry::{self, Model};
 use foreframe_core::serving::Session;
@@ -13,9 +15,10 @@ use foreframe_data::dataset::{Dataset, DatasetInfo, EpisodeData};
 use foreframe_train::evaluation::{self, EvaluateConfig};
 use serde_json::{Value, json};
 
+use crate::client::{Client, SessionHandle, numbered_frame};
 use crate::fixtures::{self, moving_squares};
 use crate::process::{output, text};
-use crate::service::{HORIZON, TIMEOUT, app, context, get, png, post, start, with_data};
+use crate::service::{HORIZON, TIMEOUT, app, context, get, png, post, run, start, with_data};
 
 const SIDE: u32 = 16;
 
@@ -120,6 +123,51 @@ fn a_session_expects_the_same_as_a_request() {
         assert!((stepped.mse / whole.mse - 1.0).abs() < 1e-3, "{stepped:?} {whole:?}");
     }
     assert!((stepped.novelty.unwrap() - whole.novelty.unwrap()).abs() < 0.01);
+}
+
+#[tokio::test]
+async fn an_imported_session_has_the_bands_of_the_exported_one() {
+    let (dir, dataset) = (tempfile::tempdir().unwrap(), moving_squares(40, SIDE, 0.2));
+    let model = calibrated(dir.path(), &dataset);
+    let app = start(with_data(dir.path(), ServerConfig::default()), vec![model]);
+    let server = run(app.clone()).await;
+    // The bands that a session gives for these frames of the first episode.
+    let bands = async |session: &SessionHandle, frames: Range<u64>| {
+        let path = session.path("/stream");
+        let mut client = Client::connect(server.address, &path, Codec::Json).await.unwrap();
+        let mut bands = Vec::new();
+        for seq in frames {
+            let frame = FrameMessage {
+                image: ImageBytes(dataset.frame(seq as usize).unwrap().pixels().to_vec()),
+                action: Some(vec![1.0]),
+                state: Some(vec![0.5]),
+                ..numbered_frame(seq)
+            };
+            if let ServerMessage::Prediction { mse_band_90, .. } = client.ask(&ClientMessage::Frame(frame)).await {
+                bands.push(mse_band_90);
+            }
+        }
+        bands
+    };
+    let exported = SessionHandle::open(&app, &json!({"model": "squares"})).await;
+    let before = bands(&exported, 0..6).await;
+    let mut state = get(&app, &exported.path("/state")).await.json();
+    let imported = async |state: &Value| SessionHandle::open(&app, &json!({"state": state})).await;
+    // The last frame is predicted again, then the next one.
+    let after = bands(&imported(&state).await, 5..7).await;
+    assert_eq!(after[0], before[3]);
+    assert_eq!(bands(&imported(&state).await, 5..7).await, after);
+    state["snapshot"]
+        .as_object_mut()
+        .unwrap()
+        .remove("past_errors")
+        .unwrap();
+    let without = bands(&imported(&state).await, 5..7).await;
+    assert!(
+        after[0] != without[0] && after[1] != without[1],
+        "{after:?} {without:?}"
+    );
+    server.stop().await;
 }
 
 #[tokio::test]

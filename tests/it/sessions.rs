@@ -237,7 +237,8 @@ async fn an_invalid_state_is_refused_with_the_field() {
         .await
         .unwrap();
     client.ask(&numbered_message(0)).await;
-    let state = get(&app, &session.path("/state")).await.json();
+    let mut state = get(&app, &session.path("/state")).await.json();
+    state["snapshot"]["past_errors"] = json!([[0.5, 1.0]]);
     for (pointer, value, status, detail) in [
         ("/weights_sha256", json!("00"), 409, "here version 1"),
         ("/model", json!("none"), 404, "there is no model"),
@@ -262,6 +263,18 @@ async fn an_invalid_state_is_refused_with_the_field() {
         ),
         ("/snapshot/actions", json!([]), 422, "actions holds 0 actions"),
         ("/snapshot/state", json!([1, 2, 3]), 422, "state holds 3 numbers"),
+        (
+            "/snapshot/past_errors",
+            json!([[0.5, 1.0], [8.0, 1.0]]),
+            422,
+            "state.snapshot.past_errors[1] is not possible",
+        ),
+        (
+            "/snapshot/past_errors",
+            json!(vec![[0.5, 1.0]; 3]),
+            422,
+            "past_errors[2] is not possible: the model predicts 2 steps",
+        ),
         ("/on_gap", json!("dance"), 422, "state.on_gap: unknown variant `dance`"),
     ] {
         let mut changed = state.clone();

@@ -3,6 +3,8 @@
 
 mod error;
 
+use std::sync::atomic::AtomicBool;
+
 use serde::Serialize;
 
 pub use self::error::AdaptError;
@@ -148,8 +150,14 @@ pub struct Adaptation<'a> {
 }
 
 impl<'a> Adaptation<'a> {
-    /// Looks at the recording. Errors: `NotAdaptable`, `NothingToJudge`, those of the settings, of the data set and of the network.
-    pub fn of(base: &'a Model, dataset: Dataset, settings: &AdaptSettings) -> Result<Self, AdaptError> {
+    /// Looks at the recording. Errors: `NotAdaptable`, `NothingToJudge`, `Cancelled` of the evaluation, those of the settings, of the data
+    /// set and of the network.
+    pub fn of(
+        base: &'a Model,
+        dataset: Dataset,
+        settings: &AdaptSettings,
+        cancelled: &AtomicBool,
+    ) -> Result<Self, AdaptError> {
         let mut config = settings.training(&base.manifest, dataset.info())?;
         let all = evaluation::windows_of(base, &dataset, Split::Validation)?;
         if all.len() < 2 {
@@ -161,7 +169,7 @@ impl<'a> Adaptation<'a> {
         let camera = if episodes.any(|episode| dataset.camera(episode).is_some()) {
             None
         } else {
-            evaluation::estimate_camera(base, &dataset, HEIGHT_M, config.data.first_seconds)?
+            evaluation::estimate_camera(base, &dataset, HEIGHT_M, config.data.first_seconds, cancelled)?
         };
         Ok(Self {
             base,

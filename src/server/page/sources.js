@@ -18,7 +18,12 @@ const fitsSimulator = model => Boolean(model.lineage.scenario)
   && (!takesActions(model) || areEqual(names(model.spec.actions), SIMULATOR_ACTIONS))
   && (!takesState(model) || areEqual(names(model.spec.states), SIMULATOR_STATES));
 
-// Whether a model can predict a data set: frame size and rate, channels, camera, and simulated or recorded have to match.
+const remembersRoom = model => Boolean(model.spec.flow?.memory);
+// Of the simulated data sets, only those with a room and a camera of its own for each episode have no common camera.
+const hasVariedRooms = dataset => Boolean(dataset.scenario) && !dataset.camera;
+
+// Whether a model can predict a data set: frame size and rate, channels, camera, and simulated or recorded have to match. A model that
+// remembers a room knows no others.
 export function fits(model, dataset) {
   const { spec, lineage } = model;
   const have_cameras = spec.camera && dataset.camera;
@@ -27,12 +32,13 @@ export function fits(model, dataset) {
     && (!takesActions(model) || areEqual(names(spec.actions), names(dataset.actions)))
     && (!takesState(model) || areEqual(names(spec.states), names(dataset.states)))
     && Boolean(lineage.scenario) === Boolean(dataset.scenario)
+    && !(remembersRoom(model) && hasVariedRooms(dataset))
     && (!have_cameras || isNear(dataset.camera.horizontal_fov_rad, spec.camera.horizontal_fov_rad));
 }
 
 // The sources that a model can be offered: { id, label }.
 export function sourcesOf(model, datasets) {
-  const knowsAnyRoom = estimatesDepth(model) && !model.spec.flow.memory;
+  const knowsAnyRoom = estimatesDepth(model) && !remembersRoom(model);
   const varied = knowsAnyRoom ? [{ id: VARIED, label: "simulator, varied rooms" }] : [];
   const simulator = fitsSimulator(model) ? [...varied, { id: "simulator", label: varied.length ? "simulator, one room" : "simulator" }] : [];
   const fitting = (datasets ?? []).filter(dataset => fits(model, dataset));

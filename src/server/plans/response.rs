@@ -41,8 +41,8 @@ struct PlannedActions {
     /// The predicted frames t+1, t+2, …, if they were asked for and there was time.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     frames: Vec<ImageBytes>,
-    /// The mean squared error to expect of each frame up to the model's horizon; absent if it was not predicted, or the model is not
-    /// calibrated.
+    /// The mean squared error to expect of each frame up to the model's horizon; in a session, it follows the session's own errors so
+    /// far. Absent if it was not predicted, or the model is not calibrated.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     expected_mse: Vec<f32>,
 }

@@ -80,11 +80,12 @@ struct RolloutResponse {
     rollouts: Vec<Vec<ImageBytes>>,
     /// How they are encoded.
     format: ImageFormat,
-    /// For each plan, the mean squared error to expect of each frame up to the model's horizon, intensities 0…1; absent if
-    /// the model is not calibrated.
+    /// For each plan, the mean squared error to expect of each frame up to the model's horizon, intensities 0…1; in a session, it
+    /// follows the session's own errors so far. Absent if the model is not calibrated.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     expected_mse: Vec<Vec<f32>>,
-    /// The 90 % band of each of these errors; absent if the model is not calibrated.
+    /// The 90 % band of each of these errors; in a session, it follows the session's own errors too. Absent if the model is not
+    /// calibrated.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     mse_band_90: Vec<Vec<[f32; 2]>>,
     /// How unlike the training data frames, state and the most usual plan are, 0…1; absent if the model is not calibrated.

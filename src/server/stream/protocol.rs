@@ -179,10 +179,11 @@ pub enum ServerMessage {
         frames: Vec<ImageBytes>,
         /// How they are encoded.
         format: ImageFormat,
-        /// The mean squared error to expect of each frame up to the model's horizon; absent if the model is not calibrated.
+        /// The mean squared error to expect of each frame up to the model's horizon, which follows the session's own errors so far;
+        /// absent if the model is not calibrated.
         #[serde(default, skip_serializing_if = "Vec::is_empty")]
         expected_mse: Vec<f32>,
-        /// The 90 % band of each of these errors; absent if the model is not calibrated.
+        /// The 90 % band of each of these errors, which follows the session's own errors too; absent if the model is not calibrated.
         #[serde(default, skip_serializing_if = "Vec::is_empty")]
         mse_band_90: Vec<[f32; 2]>,
         /// How unlike the training data frames, state and actions are, 0…1; absent if the model is not calibrated.

@@ -182,6 +182,21 @@ impl JobSpec {
         }
     }
 
+    /// Whether this is the specification of a job that was submitted as `submitted`. An adaptation that has started also names the
+    /// version that it starts from.
+    pub(super) fn is_of(&self, submitted: &Self) -> bool {
+        match (self, submitted) {
+            (Self::Adapt(own), Self::Adapt(submitted)) => {
+                let from_version = submitted.from_version.or(own.from_version);
+                *own == AdaptSpec {
+                    from_version,
+                    ..submitted.clone()
+                }
+            }
+            _ => self == submitted,
+        }
+    }
+
     /// Checks everything that can be checked before the work starts. Errors: `Invalid` and `NotFound`, which name the field;
     /// `Taken`, `Dataset`.
     pub fn check(&self, available: AvailableInputs<'_>) -> Result<(), JobError> {
@@ -357,6 +372,23 @@ mod tests {
         let text = r#"{"kind":"collect","name":"a","scenario":"crowded","trials":1,"colour":"red"}"#;
         let error = serde_json::from_str::<JobSpec>(text).unwrap_err().to_string();
         assert!(error.contains("unknown field `colour`"), "{error}");
+    }
+
+    #[test]
+    fn an_adaptation_that_names_its_version_is_of_one_that_does_not() {
+        let spec = |more: serde_json::Value| -> JobSpec {
+            let mut spec = serde_json::json!({"kind": "adapt", "name": "a", "dataset": "d"});
+            spec.as_object_mut().unwrap().extend(more.as_object().unwrap().clone());
+            serde_json::from_value(spec).unwrap()
+        };
+        let [any, first, second] = [
+            serde_json::json!({}),
+            serde_json::json!({"from_version": 1}),
+            serde_json::json!({"from_version": 2}),
+        ]
+        .map(spec);
+        assert!(first.is_of(&any) && first.is_of(&first) && !first.is_of(&second));
+        assert!(!first.is_of(&spec(serde_json::json!({"steps": 1}))));
     }
 
     #[test]

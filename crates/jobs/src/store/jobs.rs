@@ -253,6 +253,13 @@ impl Store {
         Ok(Some(cancelling))
     }
 
+    /// Replaces the specification of a running job. If the lease is lost, writes nothing and returns false. Errors: `Query`.
+    pub(crate) async fn set_spec(&self, lease: Lease, spec: &str) -> Result<bool, StoreError> {
+        let sql = "UPDATE jobs SET spec = $3 WHERE number = $1 AND token = $2 AND state = 'running'";
+        let values = values![lease.job, lease.token, spec];
+        Ok(self.database.execute(sql, values).await? > 0)
+    }
+
     /// Does not count the current attempt as one without progress, because its worker is stopping. Errors: `Query`.
     pub async fn excuse_attempt(&self, lease: Lease) -> Result<(), StoreError> {
         let sql = "UPDATE jobs SET claimed_checkpoint = -1 WHERE number = $1 AND token = $2 AND state = 'running'";

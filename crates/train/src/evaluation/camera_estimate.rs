@@ -1,6 +1,7 @@
 //! Estimates the camera of a recording: the one with which a model that sees depth predicts its frames best.
 
 use std::fmt::{self, Display, Formatter};
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use super::EvaluationError;
 use super::statistics::mean_and_deviation;
@@ -70,12 +71,14 @@ impl TriedCamera {
 }
 
 /// The camera of a data set whose camera is not known, by its training windows of the first so many `seconds` (0 for all); `height_m` says in
-/// which unit distances count. `None` if no window fits. Errors: `Mismatch`, those of the network and of [`Dataset::pixels`].
+/// which unit distances count. `None` if no window fits. Errors: `Mismatch`, `Cancelled`, those of the network and of
+/// [`Dataset::pixels`].
 pub fn estimate_camera(
     loaded: &Model,
     dataset: &Dataset,
     height_m: f32,
     seconds: f64,
+    cancelled: &AtomicBool,
 ) -> Result<Option<CameraEstimate>, EvaluationError> {
     super::compatible::check(loaded, dataset)?;
     let (shape, period_s) = (window_shape(loaded.spec()), dataset.info().frame_period_s);
@@ -90,6 +93,9 @@ pub fn estimate_camera(
         height_m: Some(height_m),
     };
     let try_one = |degrees: [f32; 2]| -> Result<TriedCamera, EvaluationError> {
+        if cancelled.load(Ordering::Acquire) {
+            return Err(EvaluationError::Cancelled);
+        }
         let with_camera = dataset.clone().with_camera(camera(degrees));
         // Later steps say less: their pictures blur with any camera.
         let errors = window_errors(loaded, &with_camera, &windows, 1)?;

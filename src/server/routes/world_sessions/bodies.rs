@@ -174,10 +174,11 @@ pub(super) struct NextObservation {
     dtype: &'static str,
     /// How `video` is encoded.
     encoding: &'static str,
-    /// The mean squared error to expect of each frame up to the model's horizon; absent if the model is not calibrated.
+    /// The mean squared error to expect of each frame up to the model's horizon, which follows the session's own errors so far;
+    /// absent if the model is not calibrated.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     expected_mse: Vec<f32>,
-    /// The 90 % band of each of these errors; absent if the model is not calibrated.
+    /// The 90 % band of each of these errors, which follows the session's own errors too; absent if the model is not calibrated.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     mse_band_90: Vec<[f32; 2]>,
     /// How unlike the training data frames, state and actions are, 0…1; absent if the model is not calibrated.

@@ -1,10 +1,13 @@
 //! Frames cut into blocks of 2×2 pixels, and back.
+// A closure's vector instructions reach what is inlined into it, and only that.
+#![allow(clippy::inline_always)]
 
 use candle_core::{Device, Result, Tensor};
 
 use crate::nn::ops::compose::{SCENE_CHANNELS, SCENE_FEATURES};
 use crate::nn::ops::pixel_shuffle::pixel_shuffle;
-use crate::nn::ops::sampling::ImageSize;
+use crate::nn::ops::sampling::{ImageSize, SAMPLED_TOGETHER};
+use crate::vectorized::vectorized;
 
 /// Channels of the moved pixels that the fine layers read: a 2×2 block and the share inside the frame.
 pub(super) const MOVED_CHANNELS: usize = 5;
@@ -39,14 +42,25 @@ pub(super) fn coarse_places(places: &[f32], values: usize, first: usize, size: I
 pub(super) fn write_blocks(frame: &[f32], size: ImageSize, places: &[f32], out: &mut [f32], first: usize) {
     let half = size.shrunk(2);
     let channels = out.len() / half.pixels();
-    for (row, places) in places.chunks_exact(2 * size.width).enumerate() {
-        let out = &mut out[row / 2 * half.width * channels..][..half.width * channels];
-        for (out, pair) in out.chunks_exact_mut(channels).zip(places.chunks_exact(4)) {
-            let out = &mut out[first + row % 2 * 2..][..2];
-            out[0] = size.around(pair[0], pair[1]).sample(frame);
-            out[1] = size.around(pair[2], pair[3]).sample(frame);
-        }
-    }
+    vectorized(
+        #[inline(always)]
+        || {
+            for (row, places) in places.chunks_exact(2 * size.width).enumerate() {
+                let out = &mut out[row / 2 * half.width * channels..][..half.width * channels];
+                let together = out.chunks_mut(SAMPLED_TOGETHER / 2 * channels);
+                for (out, places) in together.zip(places.chunks(2 * SAMPLED_TOGETHER)) {
+                    let [mut x, mut y] = [[0.0; SAMPLED_TOGETHER]; 2];
+                    for ((x, y), place) in x.iter_mut().zip(&mut y).zip(places.as_chunks::<2>().0) {
+                        [*x, *y] = *place;
+                    }
+                    let sampled = size.sample(frame, &[x, y]);
+                    for (out, pair) in out.chunks_exact_mut(channels).zip(sampled.as_chunks::<2>().0) {
+                        out[first + row % 2 * 2..][..2].copy_from_slice(pair);
+                    }
+                }
+            }
+        },
+    );
 }
 
 /// The last frames `[contexts, P]` sampled at the items' places `[M, P, 2]`: per 2×2 block its four pixels and the share

@@ -168,7 +168,7 @@ impl FlowNetwork {
         let context_of = ahead.context_of();
         let reprojection = Reprojection {
             size,
-            viewers: depths.views.viewers.clone(),
+            cameras: depths.views.cameras.clone(),
             context_of: context_of.clone(),
         };
         let places = reproject(reprojection, &depths.depths, &ahead.motion()?)?;

@@ -79,11 +79,16 @@ pub(super) struct SeenPlaces {
 
 impl SeenPlaces {
     pub(super) fn of(places: &[f32], size: ImageSize) -> Self {
-        let pixels = places.chunks_exact(PLACE_VALUES);
+        let (count, pixels) = (places.len() / PLACE_VALUES, places.chunks_exact(PLACE_VALUES));
+        let (mut room, mut inverse_depths) = (Vec::with_capacity(2 * count), Vec::with_capacity(count));
+        for place in pixels {
+            room.extend_from_slice(&place[2..4]);
+            inverse_depths.push(1.0 / place[4].max(LEAST_DEPTH_M));
+        }
         Self {
-            room: pixels.clone().flat_map(|place| [place[2], place[3]]).collect(),
+            room,
             coarse: coarse_places(places, PLACE_VALUES, 2, size),
-            inverse_depths: pixels.map(|place| 1.0 / place[4].max(LEAST_DEPTH_M)).collect(),
+            inverse_depths,
         }
     }
 
@@ -125,13 +130,16 @@ impl SeenPlaces {
         let mut values = Vec::with_capacity(context_of.len() * half.pixels() * FINE_VALUES);
         for (item, &context) in context_of.iter().enumerate() {
             let known = &views.known[context as usize * half.pixels() * KNOWN_VALUES..];
-            for block in 0..half.pixels() {
-                values.extend_from_slice(&known[block * KNOWN_VALUES..(block + 1) * KNOWN_VALUES]);
-                // The block's upper left pixel.
-                let pixel = item * pixels + block / half.width * 2 * size.width + block % half.width * 2;
-                values.push(self.inverse_depths[pixel]);
-                let outside = size.outside([self.room[2 * pixel], self.room[2 * pixel + 1]]);
-                values.push((outside / OUTSIDE_PX).min(MAX_OUTSIDE));
+            let mut blocks = known.chunks_exact(KNOWN_VALUES);
+            for row in 0..half.height {
+                for (column, known) in blocks.by_ref().take(half.width).enumerate() {
+                    values.extend_from_slice(known);
+                    // The block's upper left pixel.
+                    let pixel = item * pixels + 2 * row * size.width + 2 * column;
+                    values.push(self.inverse_depths[pixel]);
+                    let outside = size.outside([self.room[2 * pixel], self.room[2 * pixel + 1]]);
+                    values.push((outside / OUTSIDE_PX).min(MAX_OUTSIDE));
+                }
             }
         }
         Ok(Tensor::from_vec(

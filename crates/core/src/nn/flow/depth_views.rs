@@ -12,8 +12,8 @@ use rayon::prelude::*;
 use super::blocks::centred;
 use super::encoder_views::EncoderViews;
 use crate::frame::warp::CameraModel;
-use crate::nn::geometry::camera::{Viewer, rotated};
-use crate::nn::ops::sampling::{ImageSize, OfPlaces, SAMPLED_TOGETHER};
+use crate::nn::geometry::camera::{Viewer, ViewerRays, rotated};
+use crate::nn::ops::sampling::{ImageSize, SAMPLED_TOGETHER};
 use crate::vectorized::vectorized;
 
 /// Distance of everything that the floor does not explain, before anything is learned.
@@ -42,7 +42,7 @@ pub(super) struct DepthViews {
     /// Column, row and inverse depth of each 2×2 block `[contexts, H/2, W/2, KNOWN_VALUES]`.
     pub(super) known: Vec<f32>,
     /// The cameras.
-    pub(super) viewers: Vec<Viewer>,
+    pub(super) cameras: Vec<ViewerRays>,
 }
 
 impl DepthViews {
@@ -61,13 +61,14 @@ impl DepthViews {
             levels: Vec::new(),
             depths: Vec::new(),
             known: Vec::new(),
-            viewers: Vec::new(),
+            cameras: Vec::new(),
         };
         let earlier = contexts.frames_read - 1;
         for index in 0..contexts.count() {
             let camera = contexts.cameras[index].unwrap_or(CameraModel::USUAL);
-            let viewer = Viewer::new(camera, size);
-            let depths = depths_before_learning(viewer, camera.height_m.unwrap_or(CameraModel::USUAL_HEIGHT_M));
+            let height_m = camera.height_m.unwrap_or(CameraModel::USUAL_HEIGHT_M);
+            let camera = ViewerRays::from(Viewer::new(camera, size));
+            let depths = depths_before_learning(&camera.rays, height_m);
             let frame = &mut views.frames[index * pixels..(index + 1) * pixels];
             let levels = levels(frame);
             count_from(frame, levels);
@@ -79,7 +80,7 @@ impl DepthViews {
                 let mut seen = contexts.earlier[first..first + pixels].to_vec();
                 count_from(&mut seen, levels);
                 let motion = contexts.motions_back[index * earlier + back];
-                moved_back(viewer, size, &depths, motion, [frame, &seen])
+                moved_back(&camera, size, &depths, motion, [frame, &seen])
             });
             for (back, (moved, shifts)) in each.collect::<Vec<_>>().into_iter().enumerate() {
                 put_blocks(&moved, size, inputs, 4 * (back + 1));
@@ -89,7 +90,7 @@ impl DepthViews {
             views.levels.push(levels);
             views.depths.extend(depths);
             views.known.extend(known);
-            views.viewers.push(viewer);
+            views.cameras.push(camera);
         }
         views
     }
@@ -142,12 +143,12 @@ pub(super) fn count_from(frame: &mut [f32], [mean, spread]: [f32; 2]) {
 }
 
 /// The depth of each pixel, in metres, if there were only the floor and a wall around the camera.
-pub(super) fn depths_before_learning(viewer: Viewer, height_m: f32) -> Vec<f32> {
-    let depth = |[ahead, left, up]: [f32; 3]| {
-        let wall = WALL_M / ahead.hypot(left).max(1e-3);
+pub(super) fn depths_before_learning(rays: &[[f32; 3]], height_m: f32) -> Vec<f32> {
+    let depth = |&[ahead, left, up]: &[f32; 3]| {
+        let wall = WALL_M / (ahead * ahead + left * left).sqrt().max(1e-3);
         if up < 0.0 { wall.min(height_m / -up) } else { wall }
     };
-    viewer.rays().into_iter().map(depth).collect()
+    rays.iter().map(depth).collect()
 }
 
 /// Column, row and inverse depth of each 2×2 block.
@@ -167,43 +168,56 @@ pub(super) fn known(size: ImageSize, depths: &[f32]) -> Vec<f32> {
 /// An earlier frame in the view of the last one, for those depths; the last one's pixel where it saw nothing. Beside it,
 /// how far each block would shift if it were farther away.
 fn moved_back(
-    viewer: Viewer,
+    camera: &ViewerRays,
     size: ImageSize,
     depths: &[f32],
     [yaw, ahead, left]: [f32; 3],
     [last, earlier]: [&[f32]; 2],
 ) -> (Vec<f32>, Vec<f32>) {
-    let (half, rays) = (size.shrunk(2), viewer.rays());
+    let (half, viewer) = (size.shrunk(2), camera.viewer);
     let (sin, cos) = (-yaw).sin_cos();
     let (mut moved, mut shifts) = (last.to_vec(), vec![0.0; half.pixels() * 2]);
     vectorized(
         #[inline(always)]
         || {
-            let together = rays.chunks(SAMPLED_TOGETHER).zip(depths.chunks(SAMPLED_TOGETHER));
-            for (nth, ((rays, depths), moved)) in together.zip(moved.chunks_mut(SAMPLED_TOGETHER)).enumerate() {
-                let [mut near, mut far] = [[[0.0; SAMPLED_TOGETHER]; 3]; 2];
-                for (at, (ray, depth)) in rays.iter().zip(depths).enumerate() {
-                    [near[0][at], near[1][at], near[2][at]] = ray.map(|part| depth * part);
-                    [far[0][at], far[1][at], far[2][at]] = ray.map(|part| FARTHER * depth * part);
-                }
-                let [mut places, mut farther] = [[[0.0; SAMPLED_TOGETHER]; 2]; 2];
-                for at in 0..SAMPLED_TOGETHER {
-                    let seen_at = |points: &[OfPlaces; 3]| {
-                        let point = [points[0][at] - ahead, points[1][at] - left, points[2][at]];
-                        viewer.project(rotated(point, sin, cos))
-                    };
-                    [places[0][at], places[1][at]] = seen_at(&near);
-                    [farther[0][at], farther[1][at]] = seen_at(&far);
-                }
-                let sampled = size.sample(earlier, &places);
-                for (at, moved) in moved.iter_mut().enumerate() {
-                    let (x, y, pixel) = (places[0][at], places[1][at], nth * SAMPLED_TOGETHER + at);
-                    if size.shows([x, y]) {
-                        *moved = sampled[at];
+            let rows = camera.rays.chunks_exact(size.width).zip(depths.chunks_exact(size.width));
+            for (row, ((rays, depths), moved)) in rows.zip(moved.chunks_exact_mut(size.width)).enumerate() {
+                let shifts = &mut shifts[row / 2 * 2 * half.width..][..2 * half.width];
+                let together = rays.chunks(SAMPLED_TOGETHER).zip(depths.chunks(SAMPLED_TOGETHER));
+                let shifts = shifts.chunks_mut(SAMPLED_TOGETHER);
+                for (((rays, depths), moved), shifts) in together.zip(moved.chunks_mut(SAMPLED_TOGETHER)).zip(shifts) {
+                    let mut directions = [[0.0; SAMPLED_TOGETHER]; 3];
+                    let mut deep = [0.0; SAMPLED_TOGETHER];
+                    for (at, (&ray, &depth)) in rays.iter().zip(depths).enumerate() {
+                        [directions[0][at], directions[1][at], directions[2][at]] = ray;
+                        deep[at] = depth;
                     }
-                    let block = pixel / size.width / 2 * half.width + pixel % size.width / 2;
-                    shifts[2 * block] += shift(farther[0][at] - x);
-                    shifts[2 * block + 1] += shift(farther[1][at] - y);
+                    let seen_at = |farther: f32| {
+                        let mut points = [[0.0; SAMPLED_TOGETHER]; 3];
+                        for at in 0..SAMPLED_TOGETHER {
+                            let depth = farther * deep[at];
+                            let [x, y, z] = [0, 1, 2].map(|axis| depth * directions[axis][at]);
+                            [points[0][at], points[1][at], points[2][at]] =
+                                rotated([x - ahead, y - left, z], sin, cos);
+                        }
+                        viewer.project_together(&points)
+                    };
+                    let (mut places, farther) = (seen_at(1.0), seen_at(FARTHER));
+                    let sampled = size.sample(earlier, &places);
+                    for (at, moved) in moved.iter_mut().enumerate() {
+                        if size.shows([places[0][at], places[1][at]]) {
+                            *moved = sampled[at];
+                        }
+                    }
+                    for (axis, (places, farther)) in places.iter_mut().zip(&farther).enumerate() {
+                        for at in 0..SAMPLED_TOGETHER {
+                            places[at] = shift(farther[at] - places[at]);
+                        }
+                        for (shifts, pair) in shifts.chunks_exact_mut(2).zip(places.as_chunks::<2>().0) {
+                            shifts[axis] += pair[0];
+                            shifts[axis] += pair[1];
+                        }
+                    }
                 }
             }
         },
@@ -221,10 +235,11 @@ pub(super) fn shift(pixels: f32) -> f32 {
 pub(super) fn put_blocks(frame: &[f32], size: ImageSize, out: &mut [f32], first: usize) {
     let half = size.shrunk(2);
     let channels = out.len() / half.pixels();
-    for (pixel, value) in frame.iter().enumerate() {
-        let (row, column) = (pixel / size.width, pixel % size.width);
-        let block = row / 2 * half.width + column / 2;
-        out[block * channels + first + row % 2 * 2 + column % 2] = *value;
+    for (row, pixels) in frame.chunks_exact(size.width).enumerate() {
+        let blocks = out[row / 2 * half.width * channels..].chunks_exact_mut(channels);
+        for (block, pair) in blocks.zip(pixels.as_chunks::<2>().0) {
+            block[first + row % 2 * 2..][..2].copy_from_slice(pair);
+        }
     }
 }
 
@@ -247,7 +262,7 @@ mod tests {
     fn the_floor_is_as_deep_as_the_camera_is_high() {
         let camera = CameraModel::new(1.0, 0.3).unwrap();
         let viewer = Viewer::new(camera, SIZE);
-        let depths = depths_before_learning(viewer, 0.5);
+        let depths = depths_before_learning(&viewer.rays(), 0.5);
         let lowest = viewer.rays()[SIZE.pixels() - 1];
         assert!((depths[SIZE.pixels() - 1] * lowest[2] + 0.5).abs() < 1e-5);
         assert!((depths[0] * level_length(viewer.rays()[0]) - WALL_M).abs() < 1e-4);
@@ -259,10 +274,10 @@ mod tests {
 
     #[test]
     fn a_frame_seen_from_the_same_place_stays() {
-        let viewer = Viewer::new(CameraModel::new(1.0, 0.3).unwrap(), SIZE);
+        let camera = ViewerRays::from(Viewer::new(CameraModel::new(1.0, 0.3).unwrap(), SIZE));
         let frame: Vec<f32> = (0..64).map(|pixel| pixel as f32).collect();
-        let depths = depths_before_learning(viewer, 0.5);
-        let (moved, shifts) = moved_back(viewer, SIZE, &depths, [0.0; 3], [&[0.0; 64], &frame]);
+        let depths = depths_before_learning(&camera.rays, 0.5);
+        let (moved, shifts) = moved_back(&camera, SIZE, &depths, [0.0; 3], [&[0.0; 64], &frame]);
         assert!(moved.iter().zip(&frame).all(|(a, b)| (a - b).abs() < 1e-3));
         assert!(shifts.iter().all(|shift| shift.abs() < 1e-4));
     }

@@ -9,7 +9,7 @@ use candle_core::{Result, Shape, Tensor, bail};
 
 use crate::frame::warp::MIN_DEPTH;
 use crate::nn::fused::{FusedOperation, Operand, apply};
-use crate::nn::geometry::camera::{Viewer, rotated};
+use crate::nn::geometry::camera::{Viewer, ViewerRays, rotated};
 use crate::nn::ops::sampling::{ImageSize, Neighbourhood, OfPlaces, SAMPLED_TOGETHER};
 use crate::vectorized::vectorized;
 
@@ -33,7 +33,7 @@ pub(super) fn reproject(reprojection: Reprojection, depths: &Tensor, motions: &T
 pub(super) struct Reprojection {
     pub(super) size: ImageSize,
     /// The camera of each context.
-    pub(super) viewers: Vec<Viewer>,
+    pub(super) cameras: Vec<ViewerRays>,
     /// The context of each item.
     pub(super) context_of: Vec<u32>,
 }
@@ -105,12 +105,12 @@ fn found_together(viewer: Viewer, size: ImageSize, depths: &[f32], motion: Motio
     for (at, &ray) in rays.iter().enumerate() {
         [directions[0][at], directions[1][at], directions[2][at]] = rotated(ray, motion.sin, motion.cos);
     }
-    let turned = projected(viewer, &directions);
+    let turned = viewer.project_together(&directions);
     let mut found = size.sample(depths, &turned);
     let mut corrected_at = turned;
     for _ in 0..ROUNDS {
         let points = motion.points(&directions, &found);
-        corrected_at = projected(viewer, &points);
+        corrected_at = viewer.project_together(&points);
         let seen = size.sample(depths, &corrected_at);
         for at in 0..SAMPLED_TOGETHER {
             let depth = viewer.depth([points[0][at], points[1][at], points[2][at]]);
@@ -119,32 +119,17 @@ fn found_together(viewer: Viewer, size: ImageSize, depths: &[f32], motion: Motio
         }
     }
     FoundTogether {
-        room: projected(viewer, &motion.points(&directions, &found)),
+        room: viewer.project_together(&motion.points(&directions, &found)),
         turned,
         corrected_at,
         depth: found,
     }
 }
 
-/// The places of points.
-#[inline(always)]
-fn projected(viewer: Viewer, points: &[OfPlaces; 3]) -> [OfPlaces; 2] {
-    let mut places = [[0.0; SAMPLED_TOGETHER]; 2];
-    for at in 0..SAMPLED_TOGETHER {
-        [places[0][at], places[1][at]] = viewer.project([points[0][at], points[1][at], points[2][at]]);
-    }
-    places
-}
-
 impl Reprojection {
-    /// The rays of each context's camera.
-    fn rays(&self) -> Vec<Vec<[f32; 3]>> {
-        self.viewers.iter().map(|viewer| viewer.rays()).collect()
-    }
-
     fn check(&self, depths: Operand, motions: Operand) -> Result<()> {
         let (contexts, pixels) = depths.layout.shape().dims2()?;
-        let fits = contexts == self.viewers.len()
+        let fits = contexts == self.cameras.len()
             && pixels == self.size.pixels()
             && motions.dims() == [self.context_of.len(), 3]
             && self.context_of.iter().all(|&context| (context as usize) < contexts);
@@ -161,19 +146,18 @@ impl FusedOperation<2> for Reprojection {
     fn forward(&self, [depths, motions]: [Operand; 2]) -> Result<(Vec<f32>, Shape)> {
         self.check(depths, motions)?;
         let (items, pixels) = (self.context_of.len(), self.size.pixels());
-        let rays = self.rays();
         let mut out = vec![0.0; items * pixels * PLACE_VALUES];
         let outs = out.chunks_exact_mut(pixels * PLACE_VALUES);
         for ((out, motion), &context) in outs.zip(motions.values.chunks_exact(3)).zip(&self.context_of) {
             let context = context as usize;
-            let (viewer, motion) = (self.viewers[context], Motion::of(motion));
+            let (ViewerRays { viewer, rays }, motion) = (&self.cameras[context], Motion::of(motion));
             let depths = &depths.values[context * pixels..(context + 1) * pixels];
             vectorized(
                 #[inline(always)]
                 || {
                     let outs = out.chunks_mut(SAMPLED_TOGETHER * PLACE_VALUES);
-                    for (out, rays) in outs.zip(rays[context].chunks(SAMPLED_TOGETHER)) {
-                        let found = found_together(viewer, self.size, depths, motion, rays);
+                    for (out, rays) in outs.zip(rays.chunks(SAMPLED_TOGETHER)) {
+                        let found = found_together(*viewer, self.size, depths, motion, rays);
                         let FoundTogether {
                             turned, room, depth, ..
                         } = &found;
@@ -198,11 +182,11 @@ impl FusedOperation<2> for Reprojection {
         gradient: Operand,
     ) -> Result<[Option<Vec<f32>>; 2]> {
         let pixels = self.size.pixels();
-        let rays = self.rays();
         let (mut for_depths, mut for_motions) = (vec![0.0; depths.values.len()], vec![0.0; motions.values.len()]);
         for (item, &context) in self.context_of.iter().enumerate() {
             let context = context as usize;
-            let (viewer, motion) = (self.viewers[context], Motion::of(&motions.values[3 * item..]));
+            let ViewerRays { viewer, rays } = &self.cameras[context];
+            let motion = Motion::of(&motions.values[3 * item..]);
             let own = context * pixels..(context + 1) * pixels;
             let (depths, for_depths) = (&depths.values[own.clone()], &mut for_depths[own]);
             let gradients = &gradient.values[item * pixels * PLACE_VALUES..(item + 1) * pixels * PLACE_VALUES];
@@ -211,15 +195,15 @@ impl FusedOperation<2> for Reprojection {
                 #[inline(always)]
                 || {
                     let parts = gradients.chunks(SAMPLED_TOGETHER * PLACE_VALUES);
-                    for (gradients, rays) in parts.zip(rays[context].chunks(SAMPLED_TOGETHER)) {
-                        let found = found_together(viewer, self.size, depths, motion, rays);
+                    for (gradients, rays) in parts.zip(rays.chunks(SAMPLED_TOGETHER)) {
+                        let found = found_together(*viewer, self.size, depths, motion, rays);
                         let pixels = gradients.chunks_exact(PLACE_VALUES).zip(rays).enumerate();
                         for (at, (gradient, &ray)) in pixels {
                             let found = Found {
                                 depth: found.depth[at],
                                 around: self.size.around(found.corrected_at[0][at], found.corrected_at[1][at]),
                             };
-                            let of_pixel = pixel_gradient(viewer, motion, ray, &found, gradient);
+                            let of_pixel = pixel_gradient(*viewer, motion, ray, &found, gradient);
                             for (sum, part) in sums.iter_mut().zip(of_pixel.motion) {
                                 *sum += part;
                             }
@@ -282,7 +266,7 @@ mod tests {
         let camera = |fov: f32| CameraModel::new(fov, 0.2).unwrap();
         Reprojection {
             size: SIZE,
-            viewers: vec![Viewer::new(camera(1.0), SIZE), Viewer::new(camera(1.3), SIZE)],
+            cameras: [1.0, 1.3].map(|fov| Viewer::new(camera(fov), SIZE).into()).to_vec(),
             context_of: vec![0, 1, 1],
         }
     }
@@ -296,7 +280,7 @@ mod tests {
     fn a_camera_that_drives_to_a_wall_saw_it_smaller() {
         let motions = Tensor::new(&[[0.0f32, 0.5, 0.0]; 3], &Device::Cpu).unwrap();
         let flat = Reprojection {
-            viewers: vec![Viewer::new(CameraModel::new(1.0, 0.0).unwrap(), SIZE); 2],
+            cameras: vec![Viewer::new(CameraModel::new(1.0, 0.0).unwrap(), SIZE).into(); 2],
             ..reprojection()
         };
         let places = reproject(flat, &wall(3.0), &motions).unwrap();

@@ -9,7 +9,7 @@ use super::depth_views::{KNOWN_VALUES, count_from, depths_before_learning, known
 use super::encoder_views::EncoderViews;
 use crate::frame::warp::CameraModel;
 use crate::nn::error::NnError;
-use crate::nn::geometry::camera::{Viewer, rotated};
+use crate::nn::geometry::camera::{Viewer, ViewerRays, rotated};
 use crate::nn::model_tensors::ModelTensors;
 use crate::nn::ops::activated_convolution::{Activation, activated_convolution};
 use crate::nn::ops::convolution::Convolution3;
@@ -90,8 +90,9 @@ pub(super) fn speed_inputs(contexts: &EncoderViews) -> Vec<f32> {
     let mut all = vec![0.0; contexts.count() * half.pixels() * channels];
     for (index, inputs) in all.chunks_exact_mut(half.pixels() * channels).enumerate() {
         let camera = contexts.cameras[index].unwrap_or(CameraModel::USUAL);
-        let viewer = Viewer::new(camera, size);
-        let depths = depths_before_learning(viewer, camera.height_m.unwrap_or(CameraModel::USUAL_HEIGHT_M));
+        let height_m = camera.height_m.unwrap_or(CameraModel::USUAL_HEIGHT_M);
+        let camera = ViewerRays::from(Viewer::new(camera, size));
+        let depths = depths_before_learning(&camera.rays, height_m);
         let mut frame = contexts.last_frames[index * pixels..(index + 1) * pixels].to_vec();
         let levels = levels(&frame);
         count_from(&mut frame, levels);
@@ -104,7 +105,7 @@ pub(super) fn speed_inputs(contexts: &EncoderViews) -> Vec<f32> {
         }
         for (nth, motion) in SHIFTING.into_iter().enumerate() {
             put(
-                &shifts(viewer, size, &depths, motion),
+                &shifts(&camera, size, &depths, motion),
                 2,
                 inputs,
                 4 * frames_read + 2 * nth,
@@ -116,14 +117,14 @@ pub(super) fn speed_inputs(contexts: &EncoderViews) -> Vec<f32> {
 }
 
 /// How far each 2×2 block would shift if the camera turned and drove ahead, at those depths.
-fn shifts(viewer: Viewer, size: ImageSize, depths: &[f32], [turn, ahead]: [f32; 2]) -> Vec<f32> {
+fn shifts(camera: &ViewerRays, size: ImageSize, depths: &[f32], [turn, ahead]: [f32; 2]) -> Vec<f32> {
     let half = size.shrunk(2);
     let mut shifts = vec![0.0; half.pixels() * 2];
     let (sin, cos) = (-turn).sin_cos();
-    for (pixel, (ray, depth)) in viewer.rays().into_iter().zip(depths).enumerate() {
+    for (pixel, (ray, depth)) in camera.rays.iter().zip(depths).enumerate() {
         let (row, column) = (pixel / size.width, pixel % size.width);
         let point = [depth * ray[0] - ahead, depth * ray[1], depth * ray[2]];
-        let [x, y] = viewer.project(rotated(point, sin, cos));
+        let [x, y] = camera.viewer.project(rotated(point, sin, cos));
         let block = row / 2 * half.width + column / 2;
         shifts[2 * block] += shift(x - column as f32);
         shifts[2 * block + 1] += shift(y - row as f32);

@@ -5,11 +5,13 @@
 // A closure's vector instructions reach what is inlined into it, and only that.
 #![allow(clippy::inline_always)]
 
+use std::sync::Arc;
+
 use candle_core::{Result, Shape, Tensor};
 
 use crate::frame::warp::{CameraModel, CameraView, MIN_DEPTH};
 use crate::nn::fused::{FusedOperation, Operand, apply};
-use crate::nn::ops::sampling::ImageSize;
+use crate::nn::ops::sampling::{ImageSize, OfPlaces, SAMPLED_TOGETHER};
 use crate::vectorized::vectorized;
 
 /// Where a camera stands on the floor and where it looks.
@@ -80,6 +82,16 @@ impl Viewer {
         ]
     }
 
+    /// As [`Viewer::project`], of several points.
+    #[inline(always)]
+    pub(in crate::nn) fn project_together(self, points: &[OfPlaces; 3]) -> [OfPlaces; 2] {
+        let mut places = [[0.0; SAMPLED_TOGETHER]; 2];
+        for at in 0..SAMPLED_TOGETHER {
+            [places[0][at], places[1][at]] = self.project([points[0][at], points[1][at], points[2][at]]);
+        }
+        places
+    }
+
     /// Where each pixel was before the camera turned by each of the angles, in radians: `[M, P, 2]`.
     pub(in crate::nn) fn turned(self, yaws: &[f32]) -> Vec<f32> {
         let rays = self.rays();
@@ -117,6 +129,22 @@ impl Viewer {
             -(along[1] * depth - point[1] * depth_slope) * scale,
             (down_slope * depth - down * depth_slope) * scale,
         ]
+    }
+}
+
+/// A camera with the ray of each of its pixels, which are computed once.
+#[derive(Clone, Debug)]
+pub(in crate::nn) struct ViewerRays {
+    pub(in crate::nn) viewer: Viewer,
+    pub(in crate::nn) rays: Arc<[[f32; 3]]>,
+}
+
+impl From<Viewer> for ViewerRays {
+    fn from(viewer: Viewer) -> Self {
+        Self {
+            viewer,
+            rays: viewer.rays().into(),
+        }
     }
 }
 

@@ -73,18 +73,15 @@ impl ImageSize {
         );
         for at in 0..SAMPLED_TOGETHER {
             let (inside_x, inside_y) = (x[at].clamp(0.0, last_x), y[at].clamp(0.0, last_y));
-            let (left, top) = ((inside_x as i32).min(most_left), (inside_y as i32).min(most_top));
+            let (left, top) = (whole(inside_x).min(most_left), whole(inside_y).min(most_top));
             first[at] = top * self.width as i32 + left;
             right[at] = inside_x - left as f32;
             lower[at] = inside_y - top as f32;
         }
         let [mut a, mut b, mut c, mut d] = [[0.0; SAMPLED_TOGETHER]; 4];
         for at in 0..SAMPLED_TOGETHER {
-            let first = first[at] as usize;
-            a[at] = image[first];
-            b[at] = image[first + step_x];
-            c[at] = image[first + step_y];
-            d[at] = image[first + step_y + step_x];
+            let around = &image[first[at] as usize..][..step_y + step_x + 1];
+            [a[at], b[at], c[at], d[at]] = [0, step_x, step_y, step_y + step_x].map(|step| around[step]);
         }
         let mut values = [0.0; SAMPLED_TOGETHER];
         for at in 0..SAMPLED_TOGETHER {
@@ -112,6 +109,18 @@ impl ImageSize {
             moves: [(0.0..=last_x).contains(&x), (0.0..=last_y).contains(&y)],
         }
     }
+}
+
+/// The whole part of a value from 0 to 2^22; 0 of NaN. `as i32` would convert one value after the other.
+#[inline(always)]
+fn whole(value: f32) -> i32 {
+    /// 1.5 · 2^23: after adding it, the low bits hold the nearest whole number.
+    const ROUND: f32 = 12_582_912.0;
+    // Not NaN.
+    let value = value.max(0.0);
+    let shifted = value + ROUND;
+    let nearest = shifted.to_bits().wrapping_sub(ROUND.to_bits()) as i32;
+    nearest - i32::from(shifted - ROUND > value)
 }
 
 impl Neighbourhood {
@@ -254,6 +263,15 @@ mod tests {
         assert_eq!(size.around(-3.0, 9.0).sample(&image), 10.0);
         assert_eq!(size.around(1.5, 0.25).slopes(&image), [1.0, 10.0]);
         assert_eq!(size.around(-3.0, 0.5).slopes(&image), [0.0, 10.0]);
+    }
+
+    #[test]
+    fn whole_parts_are_those_of_a_conversion() {
+        for step in 0..200_000 {
+            let value = step as f32 * 0.037;
+            assert_eq!([value, value.floor()].map(whole), [value as i32, value as i32], "{value}");
+        }
+        assert_eq!([0.0, 0.5, 1.5, 2.5, 4_194_303.0, f32::NAN].map(whole), [0, 0, 1, 2, 4_194_303, 0]);
     }
 
     #[test]

@@ -6,6 +6,7 @@ use serde_json::json;
 
 use super::super::executor::{JobFailure, JobResult};
 use super::super::report::JobReporter;
+use super::super::retry_policy::RetryPolicy;
 use super::super::{AdaptSpec, JobError, JobSpec, datasets};
 use super::train::TrainingWork;
 use super::{Pipeline, failed};
@@ -33,8 +34,9 @@ impl Pipeline {
             (version, _) => version,
         };
         let (base, start) = retry.run(async || self.base(&spec.from, version).await)?;
+        let spec = &self.with_version(spec, base.manifest.version, &retry)?;
         report.progress(0, 0, "looking at the recording");
-        let adaptation = retry.repeat(|| Adaptation::of(&base, dataset.clone(), &settings))?;
+        let adaptation = retry.repeat(|| Adaptation::of(&base, dataset.clone(), &settings, cancelled))?;
         if let Some(camera) = &adaptation.camera {
             report.line(format!("camera, {camera}"));
         }
@@ -62,6 +64,21 @@ impl Pipeline {
         let mut metrics = manifest.metrics;
         metrics["adaptation"] = json!(scores);
         self.published(&spec.name, &model_dir, &metrics, &retry)
+    }
+
+    /// The job with the version that it starts from. The version is also written to the job, so that a later attempt starts from the
+    /// same one. Errors: `Cancelled` if the lease is lost.
+    fn with_version(&self, spec: &AdaptSpec, version: u32, retry: &RetryPolicy<'_>) -> Result<AdaptSpec, JobFailure> {
+        let with_version = AdaptSpec {
+            from_version: Some(version),
+            ..spec.clone()
+        };
+        if with_version == *spec {
+            return Ok(with_version);
+        }
+        let text = serde_json::to_string(&JobSpec::Adapt(with_version.clone())).map_err(|error| failed(&error))?;
+        let is_written = retry.run(async || self.store.set_spec(retry.report.lease(), &text).await)?;
+        is_written.then_some(with_version).ok_or(JobFailure::Cancelled)
     }
 
     /// The model to start from, and its weights; without a version, the active one.

@@ -31,7 +31,7 @@ pub struct AdaptSpec {
     #[serde(default = "default_base", deserialize_with = "from")]
     #[schema(value_type = String, default = "rooms")]
     pub from: ModelName,
-    /// Its version; by default the active one.
+    /// Its version. If it is absent, the job's first attempt sets it: the version that the job before it made, else the active one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub from_version: Option<u32>,
     /// Updates, of 16 windows each, 1 to 100,000; the weights with the least validation error are kept.

@@ -82,6 +82,10 @@ pub(super) fn write_outputs(
     }
 }
 
+/// Vectors of a patch. Where a vector lies in two lines of the cache, it takes longer to read and to write.
+#[repr(align(64))]
+struct PatchValues<V, const SIDE: usize>([[V; SIDE]; SIDE]);
+
 struct Patches<'a, const SIDE: usize> {
     convolution: &'a TiledConvolution<'a>,
     tiles: &'a [Tile],
@@ -95,11 +99,12 @@ impl<const SIDE: usize> WithSimd for Patches<'_, SIDE> {
     #[inline(always)]
     fn with_simd<S: Simd>(mut self, simd: S) {
         let channels = self.convolution.image.channels;
+        let mut values = PatchValues([[simd.splat_f32s(0.0); SIDE]; SIDE]);
         for (at, tile) in self.tiles.iter().enumerate() {
             for channel in (0..channels).step_by(S::F32_LANES) {
                 // The last vector may overlap the one before.
                 let channel = channel.min(channels - S::F32_LANES);
-                self.patch(simd, tile.patch + channel, at * channels + channel);
+                self.patch(simd, tile.patch + channel, at * channels + channel, &mut values.0);
             }
         }
     }
@@ -108,19 +113,20 @@ impl<const SIDE: usize> WithSimd for Patches<'_, SIDE> {
 // Indices instead of iterators and closures, which would leave the vectors in memory.
 #[allow(clippy::needless_range_loop)]
 impl<const SIDE: usize> Patches<'_, SIDE> {
-    /// Some channels of a patch, which begins there in the image, to that place in the planes.
+    /// Some channels of a patch, which begins there in the image, to that place in the planes. `values` are overwritten; to fill new
+    /// ones with zeros would take a call.
     #[inline(always)]
-    fn patch<S: Simd>(&mut self, simd: S, from: usize, to: usize) {
+    fn patch<S: Simd>(&mut self, simd: S, from: usize, to: usize, values: &mut [[S::f32s; SIDE]; SIDE]) {
         let image = self.convolution.image;
         let right = image.shape.dilation * image.channels;
         let down = image.pitch() * right;
         let plane = plane(self.tiles.len(), image.channels);
-        let mut values = [[simd.splat_f32s(0.0); SIDE]; SIDE];
         for row in 0..SIDE {
+            let mut of_row = [simd.splat_f32s(0.0); SIDE];
             for column in 0..SIDE {
-                values[row][column] = vector::<S>(self.bordered, from + row * down + column * right);
+                of_row[column] = vector::<S>(self.bordered, from + row * down + column * right);
             }
-            values[row] = transformed_values(simd, values[row]);
+            values[row] = transformed_values(simd, of_row);
         }
         for column in 0..SIDE {
             let mut of_column = [simd.splat_f32s(0.0); SIDE];
@@ -150,9 +156,10 @@ impl<const SIDE: usize> WithSimd for Outputs<'_, SIDE> {
     #[inline(always)]
     fn with_simd<S: Simd>(mut self, simd: S) {
         let width = self.convolution.weights.bias.len();
+        let mut values = PatchValues([[simd.splat_f32s(0.0); SIDE]; SIDE]);
         for (at, tile) in self.tiles.iter().enumerate() {
             for output in (0..width).step_by(S::F32_LANES) {
-                self.tile(simd, at * width + output, *tile, output);
+                self.tile(simd, at * width + output, (*tile, output), &mut values.0);
             }
         }
     }
@@ -160,21 +167,27 @@ impl<const SIDE: usize> WithSimd for Outputs<'_, SIDE> {
 
 #[allow(clippy::needless_range_loop)]
 impl<const SIDE: usize> Outputs<'_, SIDE> {
-    /// A tile's outputs of a vector from `output` on, whose sums are at that place in the planes.
+    /// A tile's outputs of a vector from `output` on, whose sums are at that place in the planes. `values` are overwritten.
     #[inline(always)]
-    fn tile<S: Simd>(&mut self, simd: S, from: usize, tile: Tile, output: usize) {
+    fn tile<S: Simd>(
+        &mut self,
+        simd: S,
+        from: usize,
+        (tile, output): (Tile, usize),
+        values: &mut [[S::f32s; SIDE]; SIDE],
+    ) {
         let (image, weights) = (self.convolution.image, self.convolution.weights);
         let bias = vector::<S>(&weights.bias, output);
         let right = image.shape.dilation * weights.outputs;
         let down = image.width * right;
         let length = S::F32_LANES.min(weights.outputs - output);
         let plane = plane(self.tiles.len(), weights.bias.len());
-        let mut values = [[simd.splat_f32s(0.0); SIDE]; SIDE];
         for row in 0..SIDE {
+            let mut of_row = [simd.splat_f32s(0.0); SIDE];
             for column in 0..SIDE {
-                values[row][column] = vector::<S>(self.planes, from + (SIDE * row + column) * plane);
+                of_row[column] = vector::<S>(self.planes, from + (SIDE * row + column) * plane);
             }
-            values[row] = sums(simd, values[row]);
+            values[row] = sums(simd, of_row);
         }
         for column in 0..SIDE - 2 {
             let mut of_column = [simd.splat_f32s(0.0); SIDE];
