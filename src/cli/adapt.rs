@@ -65,7 +65,7 @@ pub(super) fn run(args: &AdaptArgs) -> Result<(), CliError> {
     let (directory, dataset) = workspace.open_dataset(&args.dataset)?;
     let settings = settings(args, &dataset.info().name)?;
     let cancelled = interrupt::flag()?;
-    let adaptation = Adaptation::of(&base, dataset, &settings, &cancelled).map_err(not_begun)?;
+    let adaptation = Adaptation::of(&base, dataset, &settings, &cancelled).map_err(preparation_error)?;
     if let Some(camera) = &adaptation.camera {
         print_line(format!(
             "camera, {camera}; import with --fov and --tilt if you know better"
@@ -99,8 +99,8 @@ pub(super) fn run(args: &AdaptArgs) -> Result<(), CliError> {
     ))
 }
 
-/// The training did not begin, or was interrupted before it began, which is no failure.
-fn not_begun(error: AdaptError) -> CliError {
+/// Ctrl-C before the training is an interruption, not a failure.
+fn preparation_error(error: AdaptError) -> CliError {
     match error.kind() {
         ErrorKind::Cancelled => CliError::Interrupted("stopped before the training; nothing was written".to_owned()),
         _ => error.into(),

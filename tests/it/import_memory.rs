@@ -26,7 +26,8 @@ fn import_with_little_memory(dir: &Path, source: &str) -> Output {
     shell
         .current_dir(dir)
         .env("RAYON_NUM_THREADS", "2")
-        .env("MIMALLOC_ARENA_EAGER_COMMIT", "0");
+        .env("MIMALLOC_ARENA_EAGER_COMMIT", "0")
+        .env("MIMALLOC_PURGE_DELAY", "-1");
     shell.output().unwrap()
 }
 

@@ -28,6 +28,8 @@ pub const COMMAND: &str = "run-job";
 const POLL_EVERY: Duration = Duration::from_millis(20);
 /// A cancelled child that has not stopped after this time is killed.
 const CANCEL_GRACE: Duration = Duration::from_secs(8);
+/// After how many milliseconds the allocator gives freed memory back; -1: never.
+const PURGE_DELAY: &str = "MIMALLOC_PURGE_DELAY";
 
 /// How to start the child processes of jobs.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -108,6 +110,10 @@ impl ChildExecutor {
             .stdout(Stdio::piped())
             // The allocator must not reserve more memory than the limit at its start.
             .env("MIMALLOC_ARENA_EAGER_COMMIT", "0");
+        // A job keeps freed memory until it ends: the next step of a training needs it again.
+        if std::env::var_os(PURGE_DELAY).is_none() {
+            command.env(PURGE_DELAY, "-1");
+        }
         #[cfg(unix)]
         {
             // Ctrl-C in a terminal goes to the whole process group. The parent alone tells the child to stop.

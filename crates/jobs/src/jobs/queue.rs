@@ -211,7 +211,7 @@ fn check_key(key: &str) -> Result<(), JobError> {
 /// The job of an idempotency key. Errors: `Invalid` if its spec is a different one.
 fn same(row: &JobRow, spec: &JobSpec) -> Result<Job, JobError> {
     let job = Job::of(row)?;
-    if job.spec.is_of(spec) {
+    if job.spec.matches_submitted(spec) {
         return Ok(job);
     }
     let reason = format!(

@@ -182,9 +182,9 @@ impl JobSpec {
         }
     }
 
-    /// Whether this is the specification of a job that was submitted as `submitted`. An adaptation that has started also names the
-    /// version that it starts from.
-    pub(super) fn is_of(&self, submitted: &Self) -> bool {
+    /// Whether this can be the specification of a job that was submitted as `submitted`. An adaptation that has started names the
+    /// version that it starts from, so a request without one also matches a job that was submitted with one.
+    pub(super) fn matches_submitted(&self, submitted: &Self) -> bool {
         match (self, submitted) {
             (Self::Adapt(own), Self::Adapt(submitted)) => {
                 let from_version = submitted.from_version.or(own.from_version);
@@ -387,8 +387,8 @@ mod tests {
             serde_json::json!({"from_version": 2}),
         ]
         .map(spec);
-        assert!(first.is_of(&any) && first.is_of(&first) && !first.is_of(&second));
-        assert!(!first.is_of(&spec(serde_json::json!({"steps": 1}))));
+        assert!(first.matches_submitted(&any) && first.matches_submitted(&first) && !first.matches_submitted(&second));
+        assert!(!first.matches_submitted(&spec(serde_json::json!({"steps": 1}))));
     }
 
     #[test]

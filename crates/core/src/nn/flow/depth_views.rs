@@ -13,7 +13,7 @@ use super::blocks::centred;
 use super::encoder_views::EncoderViews;
 use crate::frame::warp::CameraModel;
 use crate::nn::geometry::camera::{Viewer, ViewerRays, rotated};
-use crate::nn::ops::sampling::{ImageSize, SAMPLED_TOGETHER};
+use crate::nn::ops::sampling::{ImageSize, OfPlaces, SAMPLED_TOGETHER};
 use crate::vectorized::vectorized;
 
 /// Distance of everything that the floor does not explain, before anything is learned.
@@ -145,7 +145,9 @@ pub(super) fn count_from(frame: &mut [f32], [mean, spread]: [f32; 2]) {
 /// The depth of each pixel, in metres, if there were only the floor and a wall around the camera.
 pub(super) fn depths_before_learning(rays: &[[f32; 3]], height_m: f32) -> Vec<f32> {
     let depth = |&[ahead, left, up]: &[f32; 3]| {
-        let wall = WALL_M / (ahead * ahead + left * left).sqrt().max(1e-3);
+        // The bits of glibc's `hypotf`, without a call.
+        let level = (f64::from(ahead).powi(2) + f64::from(left).powi(2)).sqrt() as f32;
+        let wall = WALL_M / level.max(1e-3);
         if up < 0.0 { wall.min(height_m / -up) } else { wall }
     };
     rays.iter().map(depth).collect()
@@ -171,58 +173,94 @@ fn moved_back(
     camera: &ViewerRays,
     size: ImageSize,
     depths: &[f32],
-    [yaw, ahead, left]: [f32; 3],
+    motion: [f32; 3],
     [last, earlier]: [&[f32]; 2],
 ) -> (Vec<f32>, Vec<f32>) {
-    let (half, viewer) = (size.shrunk(2), camera.viewer);
-    let (sin, cos) = (-yaw).sin_cos();
+    let (half, width) = (size.shrunk(2), size.width);
+    let earlier = EarlierView::new(camera.viewer, motion, earlier);
     let (mut moved, mut shifts) = (last.to_vec(), vec![0.0; half.pixels() * 2]);
     vectorized(
         #[inline(always)]
         || {
-            let rows = camera.rays.chunks_exact(size.width).zip(depths.chunks_exact(size.width));
-            for (row, ((rays, depths), moved)) in rows.zip(moved.chunks_exact_mut(size.width)).enumerate() {
-                let shifts = &mut shifts[row / 2 * 2 * half.width..][..2 * half.width];
+            for (row, moved) in moved.chunks_exact_mut(width).enumerate() {
+                let pixels = row * width..(row + 1) * width;
+                let (rays, depths) = (&camera.rays[pixels.clone()], &depths[pixels]);
                 let together = rays.chunks(SAMPLED_TOGETHER).zip(depths.chunks(SAMPLED_TOGETHER));
-                let shifts = shifts.chunks_mut(SAMPLED_TOGETHER);
-                for (((rays, depths), moved), shifts) in together.zip(moved.chunks_mut(SAMPLED_TOGETHER)).zip(shifts) {
-                    let mut directions = [[0.0; SAMPLED_TOGETHER]; 3];
-                    let mut deep = [0.0; SAMPLED_TOGETHER];
-                    for (at, (&ray, &depth)) in rays.iter().zip(depths).enumerate() {
-                        [directions[0][at], directions[1][at], directions[2][at]] = ray;
-                        deep[at] = depth;
-                    }
-                    let seen_at = |farther: f32| {
-                        let mut points = [[0.0; SAMPLED_TOGETHER]; 3];
-                        for at in 0..SAMPLED_TOGETHER {
-                            let depth = farther * deep[at];
-                            let [x, y, z] = [0, 1, 2].map(|axis| depth * directions[axis][at]);
-                            [points[0][at], points[1][at], points[2][at]] =
-                                rotated([x - ahead, y - left, z], sin, cos);
-                        }
-                        viewer.project_together(&points)
-                    };
-                    let (mut places, farther) = (seen_at(1.0), seen_at(FARTHER));
-                    let sampled = size.sample(earlier, &places);
-                    for (at, moved) in moved.iter_mut().enumerate() {
-                        if size.shows([places[0][at], places[1][at]]) {
-                            *moved = sampled[at];
-                        }
-                    }
-                    for (axis, (places, farther)) in places.iter_mut().zip(&farther).enumerate() {
-                        for at in 0..SAMPLED_TOGETHER {
-                            places[at] = shift(farther[at] - places[at]);
-                        }
-                        for (shifts, pair) in shifts.chunks_exact_mut(2).zip(places.as_chunks::<2>().0) {
-                            shifts[axis] += pair[0];
-                            shifts[axis] += pair[1];
-                        }
-                    }
+                let blocks = shifts[row / 2 * width..][..width].chunks_mut(SAMPLED_TOGETHER);
+                for (((rays, depths), moved), shifts) in together.zip(moved.chunks_mut(SAMPLED_TOGETHER)).zip(blocks) {
+                    let near = earlier.places(rays, depths, 1.0);
+                    let far = earlier.places(rays, depths, FARTHER);
+                    earlier.put(size, &near, moved);
+                    add_shifts([&near, &far], shifts);
                 }
             }
         },
     );
     (moved, shifts)
+}
+
+/// An earlier frame, and how the camera has moved since.
+struct EarlierView<'a> {
+    viewer: Viewer,
+    sin: f32,
+    cos: f32,
+    ahead: f32,
+    left: f32,
+    frame: &'a [f32],
+}
+
+impl<'a> EarlierView<'a> {
+    fn new(viewer: Viewer, [yaw, ahead, left]: [f32; 3], frame: &'a [f32]) -> Self {
+        let (sin, cos) = (-yaw).sin_cos();
+        Self {
+            viewer,
+            sin,
+            cos,
+            ahead,
+            left,
+            frame,
+        }
+    }
+
+    /// Where it shows what some neighbouring rays meet at these depths, `farther` times as deep.
+    #[inline(always)]
+    fn places(&self, rays: &[[f32; 3]], depths: &[f32], farther: f32) -> [OfPlaces; 2] {
+        let mut points = [[0.0; SAMPLED_TOGETHER]; 3];
+        for (at, (ray, depth)) in rays.iter().zip(depths).enumerate() {
+            [points[0][at], points[1][at], points[2][at]] = ray.map(|part| farther * depth * part);
+        }
+        for at in 0..SAMPLED_TOGETHER {
+            let point = [points[0][at] - self.ahead, points[1][at] - self.left, points[2][at]];
+            [points[0][at], points[1][at], points[2][at]] = rotated(point, self.sin, self.cos);
+        }
+        self.viewer.project_together(&points)
+    }
+
+    /// Writes the pixels at those places, if it shows them.
+    #[inline(always)]
+    fn put(&self, size: ImageSize, places: &[OfPlaces; 2], moved: &mut [f32]) {
+        let sampled = size.sample(self.frame, places);
+        for (at, moved) in moved.iter_mut().enumerate() {
+            if size.shows([places[0][at], places[1][at]]) {
+                *moved = sampled[at];
+            }
+        }
+    }
+}
+
+/// Adds to the blocks of a row what the shifts of its pixels add.
+#[inline(always)]
+fn add_shifts([near, far]: [&[OfPlaces; 2]; 2], shifts: &mut [f32]) {
+    for axis in 0..2 {
+        let mut of_pixels = [0.0; SAMPLED_TOGETHER];
+        for at in 0..SAMPLED_TOGETHER {
+            of_pixels[at] = shift(far[axis][at] - near[axis][at]);
+        }
+        for (shifts, pair) in shifts.chunks_exact_mut(2).zip(of_pixels.as_chunks::<2>().0) {
+            shifts[axis] += pair[0];
+            shifts[axis] += pair[1];
+        }
+    }
 }
 
 /// What a pixel's shift adds to the mean of its block's four.
@@ -280,5 +318,39 @@ mod tests {
         let (moved, shifts) = moved_back(&camera, SIZE, &depths, [0.0; 3], [&[0.0; 64], &frame]);
         assert!(moved.iter().zip(&frame).all(|(a, b)| (a - b).abs() < 1e-3));
         assert!(shifts.iter().all(|shift| shift.abs() < 1e-4));
+    }
+
+    #[test]
+    fn a_moved_camera_gives_the_bits_of_each_pixel_alone() {
+        let size = ImageSize { height: 8, width: 20 };
+        let camera = ViewerRays::from(Viewer::new(CameraModel::new(1.0, 0.3).unwrap(), size));
+        let depths = depths_before_learning(&camera.rays, 0.5);
+        let [last, earlier] = [3, 7].map(|step| (0..160).map(|pixel| (pixel * step % 11) as f32).collect::<Vec<f32>>());
+        let [yaw, ahead, left] = [-0.15, -0.2, 0.05];
+        let (moved, shifts) = moved_back(&camera, size, &depths, [yaw, ahead, left], [&last, &earlier]);
+        let (sin, cos) = (-yaw).sin_cos();
+        let place = |pixel: usize, farther: f32| {
+            let [x, y, z] = camera.rays[pixel].map(|part| farther * depths[pixel] * part);
+            camera.viewer.project(rotated([x - ahead, y - left, z], sin, cos))
+        };
+        let mut expected = vec![0.0; shifts.len()];
+        let mut shown = 0;
+        for pixel in 0..size.pixels() {
+            let (near, far) = (place(pixel, 1.0), place(pixel, FARTHER));
+            let is_shown = size.shows(near);
+            shown += usize::from(is_shown);
+            let value = if is_shown {
+                size.around(near[0], near[1]).sample(&earlier)
+            } else {
+                last[pixel]
+            };
+            assert_eq!(moved[pixel], value, "{pixel}");
+            let block = pixel / size.width / 2 * (size.width / 2) + pixel % size.width / 2;
+            for axis in 0..2 {
+                expected[2 * block + axis] += shift(far[axis] - near[axis]);
+            }
+        }
+        assert!(shown > 80 && shown < 160, "{shown}");
+        assert_eq!(shifts, expected);
     }
 }

@@ -113,8 +113,8 @@ impl<const SIDE: usize> WithSimd for Patches<'_, SIDE> {
 // Indices instead of iterators and closures, which would leave the vectors in memory.
 #[allow(clippy::needless_range_loop)]
 impl<const SIDE: usize> Patches<'_, SIDE> {
-    /// Some channels of a patch, which begins there in the image, to that place in the planes. `values` are overwritten; to fill new
-    /// ones with zeros would take a call.
+    /// Some channels of a patch, which begins there in the image, to that place in the planes. `values` are overwritten: to fill new
+    /// ones for each patch would take a call of `memset`.
     #[inline(always)]
     fn patch<S: Simd>(&mut self, simd: S, from: usize, to: usize, values: &mut [[S::f32s; SIDE]; SIDE]) {
         let image = self.convolution.image;
@@ -142,6 +142,16 @@ impl<const SIDE: usize> Patches<'_, SIDE> {
     }
 }
 
+/// A vector of a tile's outputs.
+#[derive(Clone, Copy)]
+struct OutputVector {
+    tile: Tile,
+    /// The first of them.
+    output: usize,
+    /// Where its sums begin in the planes.
+    sums: usize,
+}
+
 struct Outputs<'a, const SIDE: usize> {
     convolution: &'a TiledConvolution<'a>,
     tiles: &'a [Tile],
@@ -159,7 +169,12 @@ impl<const SIDE: usize> WithSimd for Outputs<'_, SIDE> {
         let mut values = PatchValues([[simd.splat_f32s(0.0); SIDE]; SIDE]);
         for (at, tile) in self.tiles.iter().enumerate() {
             for output in (0..width).step_by(S::F32_LANES) {
-                self.tile(simd, at * width + output, (*tile, output), &mut values.0);
+                let outputs = OutputVector {
+                    tile: *tile,
+                    output,
+                    sums: at * width + output,
+                };
+                self.tile(simd, outputs, &mut values.0);
             }
         }
     }
@@ -167,15 +182,14 @@ impl<const SIDE: usize> WithSimd for Outputs<'_, SIDE> {
 
 #[allow(clippy::needless_range_loop)]
 impl<const SIDE: usize> Outputs<'_, SIDE> {
-    /// A tile's outputs of a vector from `output` on, whose sums are at that place in the planes. `values` are overwritten.
+    /// Writes some outputs of a tile. `values` are overwritten.
     #[inline(always)]
-    fn tile<S: Simd>(
-        &mut self,
-        simd: S,
-        from: usize,
-        (tile, output): (Tile, usize),
-        values: &mut [[S::f32s; SIDE]; SIDE],
-    ) {
+    fn tile<S: Simd>(&mut self, simd: S, outputs: OutputVector, values: &mut [[S::f32s; SIDE]; SIDE]) {
+        let OutputVector {
+            tile,
+            output,
+            sums: from,
+        } = outputs;
         let (image, weights) = (self.convolution.image, self.convolution.weights);
         let bias = vector::<S>(&weights.bias, output);
         let right = image.shape.dilation * weights.outputs;
