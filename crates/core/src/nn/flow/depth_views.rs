@@ -229,9 +229,9 @@ impl<'a> EarlierView<'a> {
         for (at, (ray, depth)) in rays.iter().zip(depths).enumerate() {
             [points[0][at], points[1][at], points[2][at]] = ray.map(|part| farther * depth * part);
         }
-        for at in 0..SAMPLED_TOGETHER {
-            let point = [points[0][at] - self.ahead, points[1][at] - self.left, points[2][at]];
-            [points[0][at], points[1][at], points[2][at]] = rotated(point, self.sin, self.cos);
+        let [x, y, z] = &mut points;
+        for ((x, y), z) in x.iter_mut().zip(y).zip(z) {
+            [*x, *y, *z] = rotated([*x - self.ahead, *y - self.left, *z], self.sin, self.cos);
         }
         self.viewer.project_together(&points)
     }

@@ -80,7 +80,7 @@ impl ImageSize {
         }
         let [mut a, mut b, mut c, mut d] = [[0.0; SAMPLED_TOGETHER]; 4];
         for at in 0..SAMPLED_TOGETHER {
-            let around = &image[first[at] as usize..][..step_y + step_x + 1];
+            let around = &image[first[at] as usize..][..=step_y + step_x];
             [a[at], b[at], c[at], d[at]] = [0, step_x, step_y, step_y + step_x].map(|step| around[step]);
         }
         let mut values = [0.0; SAMPLED_TOGETHER];
