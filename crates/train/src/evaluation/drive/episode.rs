@@ -256,3 +256,24 @@ fn distance(world: &World, [x, y]: [f32; 2]) -> f32 {
     let pose = world.observer_pose();
     (x - pose.x_m).hypot(y - pose.y_m)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_collision_counts_in_its_classes() {
+        let mut result = EpisodeResult::at_start(2.0, 0.5);
+        let touch = |speed_m_s| Touch {
+            speed_m_s,
+            robot: Some(1),
+        };
+        result.count(touch(0.3), false);
+        assert_eq!((result.collisions, result.while_standing, result.unseen), (1, 0, 0));
+        result.count(touch(0.0), false);
+        assert_eq!((result.collisions, result.while_standing, result.unseen), (2, 1, 0));
+        // Its wheels turn slower than a command that drives.
+        result.count(touch(0.9 * STANDING_M_S), true);
+        assert_eq!((result.collisions, result.while_standing, result.unseen), (3, 2, 1));
+    }
+}

@@ -139,8 +139,8 @@ mod tests {
         let result = |arrived, collisions| EpisodeResult {
             arrived,
             collisions,
-            while_standing: 0,
-            unseen: 0,
+            while_standing: collisions,
+            unseen: collisions / 2,
             time_s: 4.0,
             way_m: 4.0,
             shortest_m: 2.0,
@@ -155,6 +155,7 @@ mod tests {
             (0.5, 0.75, 0.5)
         );
         assert_eq!(scores.spl.mean, 0.25);
+        assert_eq!((scores.while_standing.mean, scores.unseen.mean), (0.5, 0.25));
         // Two collisions on 16 m.
         assert_eq!(scores.collisions_per_km.mean, 125.0);
         let interval = scores.success.interval.unwrap();

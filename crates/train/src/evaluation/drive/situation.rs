@@ -116,3 +116,23 @@ pub(super) fn in_axes_of(pose: PlanarPose, [x, y]: [f32; 2]) -> [f32; 2] {
 pub(super) fn action(command: [f32; 2]) -> Result<Action, DriveError> {
     Ok(Action::try_from(command.to_vec())?)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_robot_is_seen_where_enough_of_it_is_in_the_picture() {
+        let mask = |robot: u8, pixels: usize| {
+            let mut mask = vec![0; 64];
+            mask[10..10 + pixels].fill(robot);
+            mask
+        };
+        let mut views = RobotViews::default();
+        views.record(&mask(2, SEEN_PIXELS), 3);
+        views.record(&mask(1, SEEN_PIXELS - 1), 4);
+        assert!(views.saw(2, 3, 0) && views.saw(2, 5, 2));
+        assert!(!views.saw(2, 4, 0) && !views.saw(2, 6, 2));
+        assert!(!views.saw(1, 4, 2) && !views.saw(300, 4, 2));
+    }
+}
