@@ -375,7 +375,7 @@ mod tests {
     }
 
     #[test]
-    fn an_adaptation_that_names_its_version_is_of_one_that_does_not() {
+    fn an_adaptation_that_names_its_version_matches_one_that_does_not() {
         let spec = |more: serde_json::Value| -> JobSpec {
             let mut spec = serde_json::json!({"kind": "adapt", "name": "a", "dataset": "d"});
             spec.as_object_mut().unwrap().extend(more.as_object().unwrap().clone());

@@ -248,7 +248,7 @@ impl<'a> EarlierView<'a> {
     }
 }
 
-/// Adds to the blocks of a row what the shifts of its pixels add.
+/// Adds how far some pixels of a row shift from near to far to the shifts of their blocks.
 #[inline(always)]
 fn add_shifts([near, far]: [&[OfPlaces; 2]; 2], shifts: &mut [f32]) {
     for axis in 0..2 {

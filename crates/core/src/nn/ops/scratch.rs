@@ -5,7 +5,7 @@ use std::cell::Cell;
 
 /// Buffers that an operation can have at once.
 const BUFFERS: usize = 3;
-/// Values in a line of the cache, where each buffer begins with one: a vector that lies in two takes longer to read and to write.
+/// Values in a line of the cache. Each buffer begins with a line: a vector that lies in two of them takes longer to read and to write.
 const LINE: usize = 16;
 
 thread_local! {
