@@ -1,7 +1,8 @@
 //! Time of the shipped flow networks: a window, a step of a stream, 8 windows together, and rollouts of many plans. The cases take
 //! turns, and the least of each is printed, since other programs run too.
 //!
-//! `cargo bench --bench flow [-- ROUNDS MODEL...]`; with `taskset -c 0` and `RAYON_NUM_THREADS=1` before it, on one core.
+//! `cargo bench --bench flow [-- ROUNDS MODEL...]`; with `taskset -c 0` and `RAYON_NUM_THREADS=1` before it, on one core; with
+//! `FOREFRAME_PRECISION=int8`, in that precision.
 #![allow(clippy::unwrap_used, missing_docs)]
 
 use std::path::Path;
@@ -9,6 +10,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use foreframe_core::frame::Frame;
+use foreframe_core::nn::precision;
 use foreframe_core::registry;
 use foreframe_core::registry::Model;
 use foreframe_core::serving::{PredictionInput, Session, predict};
@@ -93,6 +95,9 @@ fn timed(repeats: u32, mut call: impl FnMut()) -> Duration {
 }
 
 fn main() {
+    if let Ok(name) = std::env::var("FOREFRAME_PRECISION") {
+        precision::choose(name.parse().unwrap()).unwrap();
+    }
     let arguments: Vec<String> = std::env::args().collect();
     let is_test = arguments.iter().any(|argument| argument == "--test");
     let rounds = arguments.iter().find_map(|argument| argument.parse().ok());

@@ -1,5 +1,5 @@
 //! Time of predictions and of training steps with the default model: 64×64 px, 128 features, 256 hidden units, 5 frames of
-//! context, 5 predicted frames. All on one thread, as the server predicts.
+//! context, 5 predicted frames. All on one thread, as the server predicts; with `FOREFRAME_PRECISION=int8`, predictions in that precision.
 #![allow(clippy::unwrap_used, missing_docs)]
 
 use candle_core::{DType, Device, Tensor};
@@ -7,7 +7,7 @@ use criterion::{Criterion, criterion_group};
 use foreframe_core::frame::warp::CameraModel;
 use foreframe_core::nn::{
     Architecture, ChannelScale, Conditioning, ConditioningTensors, Feedback, FlowSpec, Loss, ModelSpec, Network,
-    Parameters,
+    Parameters, precision,
 };
 use foreframe_core::types::Seed;
 use foreframe_train::training::TrainConfig;
@@ -63,7 +63,7 @@ fn prediction(c: &mut Criterion) {
     for (name, spec) in specs() {
         let parameters = Parameters::initialize(&spec, Seed(1)).unwrap();
         let model = Network::detached(spec.clone(), &parameters)
-            .and_then(Network::packed)
+            .and_then(|network| network.packed(precision::current()))
             .unwrap();
         for windows in [1, WINDOWS] {
             let frames = values((windows, spec.context, spec.pixels()));
@@ -84,7 +84,9 @@ fn prediction(c: &mut Criterion) {
 fn step(c: &mut Criterion) {
     let spec = ModelSpec::default();
     let parameters = Parameters::initialize(&spec, Seed(1)).unwrap();
-    let model = Network::detached(spec.clone(), &parameters).unwrap();
+    let model = Network::detached(spec.clone(), &parameters)
+        .and_then(|network| network.packed(precision::current()))
+        .unwrap();
     let known = values((1, spec.context - 1, spec.code_len()));
     let frame = values((1, 1, spec.pixels())).squeeze(1).unwrap();
     c.bench_function("dense step of a stream", |b| {
@@ -155,6 +157,9 @@ fn main() {
         unsafe {
             std::env::set_var(variable, "1");
         }
+    }
+    if let Ok(name) = std::env::var("FOREFRAME_PRECISION") {
+        precision::choose(name.parse().unwrap()).unwrap();
     }
     model();
     Criterion::default().configure_from_args().final_summary();

@@ -12,8 +12,7 @@ use serde::{Deserialize, Serialize};
 use crate::server::{ServerConfig, SettingError};
 use crate::telemetry::LogFormat;
 use foreframe_core::error_kind::{ErrorKind, HasErrorKind};
-use foreframe_core::nn::NnError;
-use foreframe_core::nn::device;
+use foreframe_core::nn::{NnError, device, precision};
 use foreframe_train::settings::{LayeredSettings, SettingsError, SettingsLayer};
 
 /// The file that is read if it exists and no other is named.
@@ -193,14 +192,18 @@ impl LoadedConfig {
         Err(ConfigError::Value(sentence))
     }
 
-    /// Makes the networks of this process compute on the configured device. Errors: `Value`.
-    pub fn choose_device(&self) -> Result<(), ConfigError> {
-        let origin = self.values.origin("device");
+    /// Makes the networks of this process compute on the configured device, in the configured precision. Errors: `Value`.
+    pub fn choose_computation(&self) -> Result<(), ConfigError> {
+        let origin = |field| self.values.origin(field);
         let refused = |error| match error {
-            NnError::Device { device, reason } => format!("device is \"{device}\" ({origin}): {reason}"),
+            NnError::Device { device, reason } => format!("device is \"{device}\" ({}): {reason}", origin("device")),
+            NnError::Precision { precision, reason } => {
+                format!("precision is \"{precision}\" ({}): {reason}", origin("precision"))
+            }
             other => other.to_string(),
         };
-        let chosen = device::choose(self.config.server.device);
+        let server = &self.config.server;
+        let chosen = device::choose(server.device).and_then(|()| precision::choose(server.precision));
         chosen.map_err(|error| ConfigError::Value(refused(error)))
     }
 
@@ -249,6 +252,7 @@ fn expected(field: &str) -> Option<String> {
         "bind" => "HOST:PORT, as in 127.0.0.1:8642 or localhost:8642",
         "admin_bind" => "HOST:PORT, as in 127.0.0.1:8643, or off",
         "device" => "cpu, cuda or cuda:N",
+        "precision" => "f32, bf16 or int8",
         "port" => "0 to 65535",
         _ => return range(field),
     };

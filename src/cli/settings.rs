@@ -145,14 +145,14 @@ fn flag_layers(flags: &impl Serialize) -> Vec<SettingsLayer> {
 fn start(loaded: LoadedConfig) -> Result<Config, CliError> {
     // Short commands send no traces.
     let _ = telemetry::init(loaded.config.log_format, None)?;
-    loaded.choose_device()?;
+    loaded.choose_computation()?;
     Ok(loaded.config)
 }
 
-/// The configuration of a command that is about to work in its directories, on its device. Errors: `Usage` if one cannot be used.
+/// The configuration of a command that is about to work in its directories, on its device, in its precision. Errors: `Usage` if one cannot be used.
 pub(super) fn with_checked_directories(loaded: LoadedConfig) -> Result<Config, CliError> {
     loaded.check_directories()?;
-    loaded.choose_device()?;
+    loaded.choose_computation()?;
     Ok(loaded.config)
 }
 

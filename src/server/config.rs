@@ -7,6 +7,7 @@ use std::time::Duration;
 use serde::{Deserialize, Serialize};
 
 use foreframe_core::nn::device::DeviceName;
+use foreframe_core::nn::precision::Precision;
 use foreframe_core::nn::spec::MAX_STEPS;
 use foreframe_core::serving::PredictorConfig;
 use foreframe_data::dataset::import::{DEFAULT_DISK_MIB, DEFAULT_MAX_FILES};
@@ -77,6 +78,10 @@ settings! {
     /// the Cargo feature `cuda`.
     #[schema(value_type = String)]
     device: DeviceName = DeviceName::Cpu;
+    /// In which numbers the processor predicts: `f32`, or for faster and slightly less exact predictions `bf16` or `int8`, which need
+    /// a processor with AVX-512 BF16 or AVX-512 VNNI.
+    #[schema(value_type = String)]
+    precision: Precision = Precision::F32;
     /// `sqlite:FILE` or `postgres://…`. Default: a file in the data directory.
     database_url: Option<String> = None;
     /// How long a starting server or worker waits for its PostgreSQL, in seconds.
@@ -275,6 +280,7 @@ impl ServerConfig {
     pub fn job_resources(&self) -> JobResources {
         JobResources {
             device: self.device,
+            precision: self.precision,
             threads: self.job_threads,
             memory: JobMemory {
                 limit_mib: self.job_memory_mib,

@@ -177,13 +177,31 @@ fn a_device_is_named_and_one_that_cannot_be_used_is_refused_with_its_source() {
     );
     LoadedConfig::from_layers(set("device=cpu"))
         .unwrap()
-        .choose_device()
+        .choose_computation()
         .unwrap();
     // Built without CUDA; with it, this process has chosen the CPU above.
     let loaded = LoadedConfig::from_layers(set("device=cuda:99")).unwrap();
-    let error = loaded.choose_device().unwrap_err().to_string();
+    let error = loaded.choose_computation().unwrap_err().to_string();
     assert!(error.starts_with("device is \"cuda:99\" (--set): "), "{error}");
     if !cfg!(feature = "cuda") {
         assert!(error.contains("cargo build --release --features cuda"), "{error}");
     }
+}
+
+#[test]
+fn a_precision_is_named_and_another_one_than_the_first_is_refused_with_its_source() {
+    let set = |text: &str| vec![SettingsLayer::assignment(text).unwrap()];
+    let error = refused(set("precision=f16"));
+    assert!(
+        error.contains("precision is \"f16\" (--set)") && error.contains("f32, bf16 or int8"),
+        "{error}"
+    );
+    LoadedConfig::from_layers(set("precision=f32"))
+        .unwrap()
+        .choose_computation()
+        .unwrap();
+    // Another one was chosen above, or this processor cannot.
+    let loaded = LoadedConfig::from_layers(set("precision=int8")).unwrap();
+    let error = loaded.choose_computation().unwrap_err().to_string();
+    assert!(error.starts_with("precision is \"int8\" (--set): this process"), "{error}");
 }

@@ -4,6 +4,7 @@ use std::path::Path;
 
 use candle_core::{Device, Tensor};
 use foreframe_core::nn::{ChannelScale, ConditioningTensors, ModelSpec, Network};
+use foreframe_core::nn::precision::Precision;
 use foreframe_core::registry;
 
 use crate::nn_fixtures::{largest_difference, values};
@@ -15,6 +16,10 @@ fn packed(name: &str) -> Network {
 fn on_tensors(name: &str) -> Network {
     let weights = registry::load_weights(&Path::new("models").join(name)).unwrap();
     Network::detached(weights.manifest.spec, &weights.parameters).unwrap()
+}
+
+fn in_precision(name: &str, precision: Precision) -> Network {
+    on_tensors(name).packed(precision).unwrap()
 }
 
 /// Noise of the contrast that frames of a camera have.
@@ -65,11 +70,42 @@ fn packed_weights_predict_what_the_tensors_predict() {
 }
 
 #[test]
+fn fewer_bits_predict_nearly_the_same() {
+    for name in ["static", "moving", "moving-flow", "rooms", "home", "static-flow"] {
+        let on_tensors = on_tensors(name);
+        let (spec, windows) = (on_tensors.spec(), [0, 1, 1, 0]);
+        let (frames, plans) = (frames(spec, 2), plans(spec, windows.len()));
+        let frames = frames.reshape((2 * spec.context, ())).unwrap();
+        let predicted = |network: &Network| {
+            let codes = network.encode_frames(&frames).unwrap();
+            let codes = codes.reshape((2, spec.context, ())).unwrap();
+            let ahead = network.predict_rollouts(&codes, &windows, &plans).unwrap();
+            network.decode_frames(&ahead.flatten(0, 1).unwrap()).unwrap()
+        };
+        let expected = predicted(&on_tensors);
+        for (precision, bound) in [(Precision::Bf16, 3e-3), (Precision::Int8, 1e-2)] {
+            if !precision.is_supported() {
+                eprintln!("skipped: this processor does not multiply {precision}");
+                continue;
+            }
+            let found = predicted(&in_precision(name, precision));
+            let differences = (found - &expected).unwrap().abs().unwrap();
+            let mean = differences.mean_all().unwrap().to_scalar::<f32>().unwrap();
+            assert!(mean < bound, "{name} in {precision}: {mean} of full scale in the mean");
+        }
+    }
+}
+
+#[test]
 fn many_plans_give_the_bits_that_each_alone_gives() {
-    for name in ["moving-flow", "rooms", "home"] {
-        let network = packed(name);
+    let networks = ["moving-flow", "rooms", "home"].map(packed).into_iter();
+    let in_fewer_bits = [Precision::Bf16, Precision::Int8].into_iter().filter(|precision| precision.is_supported());
+    let in_fewer_bits = in_fewer_bits.flat_map(|precision| ["moving", "rooms"].map(|name| in_precision(name, precision)));
+    for network in networks.chain(in_fewer_bits) {
         let spec = network.spec();
-        let (frames, plans) = (frames(spec, 1), plans(spec, 21));
+        let plans = plans(spec, 21);
+        let frames = network.encode_frames(&frames(spec, 1).reshape((spec.context, ())).unwrap()).unwrap();
+        let frames = frames.reshape((1, spec.context, ())).unwrap();
         let together = network.predict_rollouts(&frames, &[0; 21], &plans).unwrap();
         for plan in [0, 7, 20] {
             let row = |tensor: &Tensor| tensor.narrow(0, plan, 1).unwrap();
@@ -79,7 +115,7 @@ fn many_plans_give_the_bits_that_each_alone_gives() {
                 ..ConditioningTensors::none()
             };
             let alone = network.predict_rollouts(&frames, &[0], &own).unwrap();
-            assert_eq!(largest_difference(&alone, &row(&together)), 0.0, "{name}");
+            assert_eq!(largest_difference(&alone, &row(&together)), 0.0, "{:?}", spec.architecture);
         }
     }
 }

@@ -87,6 +87,14 @@ pub enum NnError {
         /// Why not, and what can be done.
         reason: String,
     },
+    /// Predictions cannot be in this precision.
+    #[error("precision is \"{precision}\": {reason}")]
+    Precision {
+        /// The precision.
+        precision: super::precision::Precision,
+        /// Why not, and what can be done.
+        reason: String,
+    },
     /// No camera has this field of view or tilt.
     #[error("model specification: {0}")]
     Camera(#[source] crate::frame::FrameError),
@@ -176,7 +184,7 @@ impl HasErrorKind for NnError {
     fn kind(&self) -> ErrorKind {
         match self {
             // These come from settings.
-            Self::OutOfRange { .. } | Self::NoChannels { .. } | Self::Device { .. } => ErrorKind::Usage,
+            Self::OutOfRange { .. } | Self::NoChannels { .. } | Self::Device { .. } | Self::Precision { .. } => ErrorKind::Usage,
             Self::Tensor(_) => ErrorKind::Internal,
             _ => ErrorKind::Unusable,
         }

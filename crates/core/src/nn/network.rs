@@ -13,6 +13,7 @@ use super::geometry::state_channels::StateChannels;
 use super::geometry::wheel_dynamics;
 use super::model_tensors::ModelTensors;
 use super::parameters::{Parameters, of_shape};
+use super::precision::Precision;
 use super::spec::{Architecture, ModelSpec, in_range};
 use super::tensors::with_values;
 
@@ -74,11 +75,12 @@ impl Network {
     }
 
     /// The same network with its weights packed as they are now, for faster predictions; it sees no update of the parameters.
-    /// Predictions differ by less than 1e-5 of full scale, by less than 3e-5 where depth is estimated, at sharp edges. The dense
-    /// network stays as it is. Errors: `Tensor`.
-    pub fn packed(mut self) -> Result<Self, NnError> {
-        if let AnyNetwork::Flow(flow) = &mut self.network {
-            flow.pack()?;
+    /// In single precision, predictions differ by less than 1e-5 of full scale, by less than 3e-5 where depth is estimated, at sharp edges. The dense
+    /// network stays as it is in single precision. Errors: `Tensor`.
+    pub fn packed(mut self, precision: Precision) -> Result<Self, NnError> {
+        match &mut self.network {
+            AnyNetwork::Flow(flow) => flow.pack(precision)?,
+            AnyNetwork::Dense(dense) => dense.pack(precision)?,
         }
         Ok(self)
     }

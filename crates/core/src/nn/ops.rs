@@ -3,6 +3,7 @@
 pub(super) mod activated_convolution;
 pub(super) mod activation;
 mod bordered_convolution;
+mod byte_convolution;
 pub(super) mod compose;
 pub(super) mod convolution;
 pub(super) mod image_geometry;
@@ -10,6 +11,8 @@ pub(super) mod linear;
 pub(super) mod modulation;
 pub(super) mod packed;
 pub(super) mod pixel_shuffle;
+mod reduced;
+pub(super) mod row_weights;
 pub(super) mod sampling;
 mod scratch;
 mod winograd;

@@ -12,7 +12,7 @@ use super::error::RegistryError;
 use super::layout::{MANIFEST_FILE, WEIGHTS_FILE};
 use super::manifest::{self, Manifest};
 use crate::files::sha256_hex;
-use crate::nn::{ModelSpec, Network, NnError, Parameters};
+use crate::nn::{ModelSpec, Network, NnError, Parameters, precision};
 use crate::types::ModelName;
 
 /// The largest weights file that is accepted, in bytes.
@@ -51,7 +51,7 @@ pub struct StoredWeights {
 /// `Weights`, `Device`.
 pub fn load(model_dir: &Path) -> Result<Model, RegistryError> {
     let StoredWeights { manifest, parameters } = load_weights(model_dir)?;
-    let network = Network::detached(manifest.spec.clone(), &parameters).and_then(Network::packed);
+    let network = Network::detached(manifest.spec.clone(), &parameters).and_then(|network| network.packed(precision::current()));
     let network = network.map_err(|source| match source {
         NnError::Device { .. } => RegistryError::Device(source),
         _ => RegistryError::Weights {

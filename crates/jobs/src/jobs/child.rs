@@ -20,7 +20,7 @@ use super::retry_policy::RetryPolicy;
 use super::{JobError, JobSpec};
 use crate::store::{Lease, Store, StoreConfig};
 use crate::versions::Versions;
-use foreframe_core::nn::device;
+use foreframe_core::nn::{device, precision};
 
 /// The subcommand of the child process.
 pub const COMMAND: &str = "run-job";
@@ -208,7 +208,9 @@ pub fn run() -> Result<(), String> {
     }
     let order: JobOrder = serde_json::from_str(&line).map_err(|error| error.to_string())?;
     limit(order.process.resources.memory.limit_mib);
-    device::choose(order.process.resources.device).map_err(|error| error.to_string())?;
+    let resources = &order.process.resources;
+    let chosen = device::choose(resources.device).and_then(|()| precision::choose(resources.precision));
+    chosen.map_err(|error| error.to_string())?;
     let cancelled = Arc::new(AtomicBool::new(false));
     let flag = Arc::clone(&cancelled);
     std::thread::spawn(move || {

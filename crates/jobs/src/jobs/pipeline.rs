@@ -29,6 +29,7 @@ use crate::store::{JobId, Store};
 use crate::versions::Versions;
 use foreframe_core::error_text;
 use foreframe_core::nn::device::DeviceName;
+use foreframe_core::nn::precision::Precision;
 use foreframe_core::types::{DatasetName, ModelName};
 use foreframe_data::dataset::{Dataset, DatasetInfo};
 use foreframe_train::evaluation;
@@ -38,6 +39,8 @@ use foreframe_train::evaluation;
 pub struct JobResources {
     /// Where its networks compute.
     pub device: DeviceName,
+    /// In which precision its evaluations predict.
+    pub precision: Precision,
     /// How many threads it uses.
     pub threads: usize,
     /// Its memory: trainings that need more are refused, and no more of a data set's frames are held.

@@ -9,6 +9,7 @@ use crate::nn::error::NnError;
 use crate::nn::model_tensors::ModelTensors;
 use crate::nn::ops::linear::Linear;
 use crate::nn::options::{PredictorOutput, Reconstruction};
+use crate::nn::precision::Precision;
 use crate::nn::spec::{DenseSpec, ModelSpec};
 
 /// What the predictor gets as the previous frame in each step.
@@ -60,6 +61,18 @@ impl DenseNetwork {
             spec,
             sizes,
         }
+    }
+
+    /// Packs what a prediction needs in this precision; in single precision, and on another device, it stays as it is.
+    pub(in crate::nn) fn pack(&mut self, precision: Precision) -> Result<(), NnError> {
+        if precision == Precision::F32 || self.layers == LayerForm::Plain {
+            return Ok(());
+        }
+        for layer in [&mut self.frame_encoder, &mut self.frame_decoder, &mut self.predictor_output] {
+            layer.pack(precision)?;
+        }
+        self.encoder.pack(0, precision)?;
+        self.predictor.pack(self.sizes.features, precision)
     }
 
     /// The same network for another number of steps.

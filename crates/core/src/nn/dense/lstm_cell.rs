@@ -1,9 +1,14 @@
 //! The weights and the state of an LSTM cell with diagonal peepholes (paper, equations 1–5; Graves 2013).
 
+use std::sync::Arc;
+
 use candle_core::Tensor;
 
 use crate::nn::error::NnError;
 use crate::nn::ops::linear::Linear;
+use crate::nn::ops::row_weights::RowWeights;
+use crate::nn::precision::Precision;
+use crate::nn::tensors::with_values;
 
 /// The state of an LSTM between two steps.
 #[derive(Clone, Debug)]
@@ -25,6 +30,18 @@ pub struct PeepholeCell {
     pub(super) bias: Tensor,
     /// Diagonals of `W_ci`, `W_cf` and `W_co`, `[H]` each.
     pub(super) peepholes: [Tensor; 3],
+    /// For prediction in another than single precision.
+    pub(super) packed: Option<Arc<PackedCell>>,
+}
+
+/// The weights of a cell, packed.
+#[derive(Debug)]
+pub(super) struct PackedCell {
+    /// Of the inputs that are fed back, which come first; none for an encoder.
+    pub(super) fed_back: Option<RowWeights>,
+    /// Of the other inputs, with the bias.
+    pub(super) projection: RowWeights,
+    pub(super) recurrent: RowWeights,
 }
 
 impl PeepholeCell {
@@ -36,7 +53,26 @@ impl PeepholeCell {
             w_h,
             bias,
             peepholes,
+            packed: None,
         }
+    }
+
+    /// Packs the weights as they are now; so many of the inputs are fed back.
+    pub(super) fn pack(&mut self, fed_back: usize, precision: Precision) -> Result<(), NnError> {
+        let (inputs, width) = self.w_x.dims2()?;
+        let no_bias = vec![0.0; width];
+        let bias = self.bias.to_vec1::<f32>()?;
+        let of_rows = |first: usize, rows: usize, bias: &[f32]| {
+            let rows = self.w_x.narrow(0, first, rows)?;
+            with_values(&rows, |weights| RowWeights::new(weights, bias, precision))
+        };
+        let packed = PackedCell {
+            fed_back: (fed_back > 0).then(|| of_rows(0, fed_back, &no_bias)).transpose()?,
+            projection: of_rows(fed_back, inputs - fed_back, &bias)?,
+            recurrent: with_values(&self.w_h, |weights| RowWeights::new(weights, &no_bias, precision))?,
+        };
+        self.packed = Some(Arc::new(packed));
+        Ok(())
     }
 
     /// Hidden units, H.

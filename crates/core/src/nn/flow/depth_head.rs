@@ -14,6 +14,7 @@ use crate::nn::ops::linear::{Linear, per_place};
 use crate::nn::ops::modulation::silu;
 use crate::nn::ops::pixel_shuffle::pixel_shuffle;
 use crate::nn::ops::sampling::{ImageSize, own_places};
+use crate::nn::precision::Precision;
 
 /// Values beside the moved features from which a step's state is made: place and inverse depth, and whether the last frame
 /// showed it.
@@ -46,9 +47,9 @@ impl DepthHead {
     }
 
     /// Packs the layers' weights for prediction.
-    pub(super) fn pack(&mut self) -> Result<(), NnError> {
-        self.enlarge.pack()?;
-        Ok(self.output.pack()?)
+    pub(super) fn pack(&mut self, precision: Precision) -> Result<(), NnError> {
+        self.enlarge.pack(precision.of_few_inputs())?;
+        Ok(self.output.pack(precision)?)
     }
 
     /// The depth of each pixel of the last frames `[contexts, P]`, in metres.

@@ -18,6 +18,7 @@ use crate::nn::ops::compose::SCENE_FEATURES;
 use crate::nn::ops::convolution::Convolution3;
 use crate::nn::ops::image_geometry::ConvShape;
 use crate::nn::ops::pixel_shuffle::pixel_shuffle;
+use crate::nn::precision::Precision;
 use crate::nn::spec::ModelSpec;
 
 /// Subtracted from the logit of the remembered pixel's share, so that an untrained memory hardly counts.
@@ -61,10 +62,10 @@ impl Memory {
     }
 
     /// Packs the layers' weights for prediction.
-    pub(super) fn pack(&mut self) -> Result<(), NnError> {
-        self.scene.pack()?;
+    pub(super) fn pack(&mut self, precision: Precision) -> Result<(), NnError> {
+        self.scene.pack(precision)?;
         for layer in [&mut self.seen, &mut self.fine, &mut self.share] {
-            layer.pack()?;
+            layer.pack(precision)?;
         }
         Ok(())
     }

@@ -12,6 +12,7 @@ use crate::nn::model_tensors::ModelTensors;
 use crate::nn::ops::linear::Linear;
 use crate::nn::ops::modulation::perceptron;
 use crate::nn::ops::sampling::ImageSize;
+use crate::nn::precision::Precision;
 use crate::nn::spec::{FlowSpec, ModelSpec};
 
 /// Hidden units of the correction.
@@ -52,9 +53,9 @@ impl MotionHead {
     }
 
     /// Packs the layers' weights for prediction.
-    pub(super) fn pack(&mut self) -> Result<(), NnError> {
+    pub(super) fn pack(&mut self, precision: Precision) -> Result<(), NnError> {
         for layer in self.layers.iter_mut().flatten().chain(&mut self.affine) {
-            layer.pack()?;
+            layer.pack(precision.of_few_inputs())?;
         }
         Ok(())
     }

@@ -7,6 +7,7 @@ use crate::nn::model_tensors::ModelTensors;
 use crate::nn::ops::linear::{Linear, per_place};
 use crate::nn::ops::modulation::silu;
 use crate::nn::ops::pixel_shuffle::pixel_shuffle;
+use crate::nn::precision::Precision;
 
 /// The layers that tell where movers are, as logits of each pixel.
 #[derive(Clone, Debug)]
@@ -24,9 +25,9 @@ impl MoverHead {
     }
 
     /// Packs the layers' weights for prediction.
-    pub(super) fn pack(&mut self) -> Result<(), NnError> {
-        self.seen.pack()?;
-        Ok(self.coming.pack()?)
+    pub(super) fn pack(&mut self, precision: Precision) -> Result<(), NnError> {
+        self.seen.pack(precision)?;
+        Ok(self.coming.pack(precision)?)
     }
 
     /// Where they are in the last frames `[contexts, P]`, from the encoder's features.

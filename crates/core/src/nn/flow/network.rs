@@ -18,6 +18,7 @@ use crate::nn::ops::image_geometry::ConvShape;
 use crate::nn::ops::linear::{Linear, per_place};
 use crate::nn::ops::modulation::{perceptron, silu};
 use crate::nn::ops::pixel_shuffle::pixel_shuffle;
+use crate::nn::precision::Precision;
 use crate::nn::spec::{FlowSpec, ModelSpec};
 
 /// What the network gives for a batch.
@@ -116,31 +117,31 @@ impl FlowNetwork {
     }
 
     /// Packs the weights of all layers as they are now, for fast prediction; plain tensor operations take them as they are.
-    pub(in crate::nn) fn pack(&mut self) -> Result<(), NnError> {
+    pub(in crate::nn) fn pack(&mut self, precision: Precision) -> Result<(), NnError> {
         if self.is_plain {
             return Ok(());
         }
         let convolutions = [&mut self.stem, &mut self.halving, &mut self.fine, &mut self.head].into_iter();
         let blocks = self.blocks.iter_mut().chain(&mut self.refine).flatten();
         for convolution in convolutions.chain(blocks) {
-            convolution.pack()?;
+            convolution.pack(precision)?;
         }
         for linear in self.modulation.iter_mut().chain([&mut self.mix, &mut self.enlarge]) {
-            linear.pack()?;
+            linear.pack(precision.of_few_inputs())?;
         }
-        self.motion.pack()?;
+        self.motion.pack(precision)?;
         if let Some(movers) = &mut self.movers {
-            movers.pack()?;
+            movers.pack(precision)?;
         }
         if let Some(speeds) = &mut self.speeds {
-            speeds.pack()?;
+            speeds.pack(precision)?;
         }
         if let Some(memory) = &mut self.memory {
-            memory.pack()?;
+            memory.pack(precision)?;
         }
         match &mut self.surroundings {
-            Surroundings::Remembered(scene) => scene.pack(),
-            Surroundings::Seen(depth) => depth.pack(),
+            Surroundings::Remembered(scene) => scene.pack(precision),
+            Surroundings::Seen(depth) => depth.pack(precision),
         }
     }
 

@@ -19,6 +19,7 @@ use crate::nn::ops::compose::SCENE_CHANNELS;
 use crate::nn::ops::linear::Linear;
 use crate::nn::ops::modulation::perceptron;
 use crate::nn::ops::sampling::ImageSize;
+use crate::nn::precision::Precision;
 use crate::nn::spec::{MIN_CHANNEL_STD, ModelSpec};
 use crate::nn::tensors::with_values;
 
@@ -109,9 +110,9 @@ impl Scene {
     }
 
     /// Packs the layers' weights for prediction.
-    pub(super) fn pack(&mut self) -> Result<(), NnError> {
+    pub(super) fn pack(&mut self, precision: Precision) -> Result<(), NnError> {
         for layer in &mut self.layers {
-            layer.pack()?;
+            layer.pack(precision.of_few_inputs())?;
         }
         Ok(())
     }

@@ -17,6 +17,7 @@ use crate::nn::ops::image_geometry::ConvShape;
 use crate::nn::ops::linear::{Linear, per_place};
 use crate::nn::ops::modulation::silu;
 use crate::nn::ops::sampling::ImageSize;
+use crate::nn::precision::Precision;
 
 /// Channels of the layers.
 pub(super) const SPEED_CHANNELS: usize = 32;
@@ -54,11 +55,11 @@ impl SpeedHead {
     }
 
     /// Packs the layers' weights for prediction.
-    pub(super) fn pack(&mut self) -> Result<(), NnError> {
+    pub(super) fn pack(&mut self, precision: Precision) -> Result<(), NnError> {
         for convolution in self.blocks.iter_mut().chain([&mut self.halving]) {
-            convolution.pack()?;
+            convolution.pack(precision)?;
         }
-        Ok(self.votes.pack()?)
+        Ok(self.votes.pack(precision.of_few_inputs())?)
     }
 
     /// Forward speed in m/s and yaw rate in rad/s at the last frame of each context `[contexts, 2]`.

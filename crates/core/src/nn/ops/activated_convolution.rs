@@ -86,6 +86,7 @@ mod tests {
     use super::*;
     use crate::nn::gradient_check::{noise, values};
     use crate::nn::ops::image_geometry::ConvShape;
+    use crate::nn::precision::Precision;
 
     #[test]
     fn packed_weights_give_what_the_tensors_give() {
@@ -109,11 +110,18 @@ mod tests {
                 })
             };
             let plain = outputs(&layer);
-            layer.pack().unwrap();
-            for (plain, packed) in plain.iter().flatten().zip(outputs(&layer).iter().flatten()) {
-                assert_eq!(plain.dims(), packed.dims());
-                let most = (plain - packed).unwrap().abs().unwrap().max_all().unwrap();
-                assert!(most.to_scalar::<f32>().unwrap() < 1e-5, "{shape:?}: {most}");
+            // The activated values are at most 3, the weights at most 1, and a sum has 27 of them.
+            for (precision, bound) in [(Precision::F32, 1e-5), (Precision::Bf16, 0.08), (Precision::Int8, 0.15)] {
+                if !precision.is_supported() {
+                    eprintln!("skipped: this processor does not multiply {precision}");
+                    continue;
+                }
+                layer.pack(precision).unwrap();
+                for (plain, packed) in plain.iter().flatten().zip(outputs(&layer).iter().flatten()) {
+                    assert_eq!(plain.dims(), packed.dims());
+                    let most = (plain - packed).unwrap().abs().unwrap().max_all().unwrap();
+                    assert!(most.to_scalar::<f32>().unwrap() < bound, "{shape:?}, {precision}: {most}");
+                }
             }
         }
     }
@@ -132,16 +140,18 @@ mod tests {
                 shape,
                 packed: None,
             };
-            layer.pack().unwrap();
             let (x, modulation) = (noise(&[2, 32, 32, channels], 1), noise(&[2, 2 * channels], 4));
-            let of_threads = |threads: usize| {
+            let of_threads = |layer: &Convolution3, threads: usize| {
                 let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-                let convolve = || activated_convolution(&layer, &x, Activation::Modulated(&modulation), None);
+                let convolve = || activated_convolution(layer, &x, Activation::Modulated(&modulation), None);
                 values(&pool.install(convolve).unwrap())
             };
-            let alone = of_threads(1);
-            for threads in [2, 3, 5, 8] {
-                assert_eq!(of_threads(threads), alone, "{shape:?}, {threads}");
+            for precision in Precision::ALL.into_iter().filter(|precision| precision.is_supported()) {
+                layer.pack(precision).unwrap();
+                let alone = of_threads(&layer, 1);
+                for threads in [2, 3, 5, 8] {
+                    assert_eq!(of_threads(&layer, threads), alone, "{shape:?}, {threads}, {precision}");
+                }
             }
         }
     }

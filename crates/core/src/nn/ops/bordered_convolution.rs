@@ -6,11 +6,13 @@
 
 use rayon::prelude::*;
 
+use super::byte_convolution::{ByteConvolution, ByteKernel};
 use super::image_geometry::{ImageGeometry, TAPS};
 use super::modulation::activate;
 use super::packed::{PackedWeights, PlaceInputs, StartSums, TapRun};
 use super::scratch::with_buffers;
 use super::winograd::{PatchWeights, TileSize, TiledConvolution};
+use crate::nn::precision::Precision;
 use crate::vectorized::vectorized;
 
 /// Least multiply–adds of a strip. A smaller one takes hardly longer than it takes to wake a thread.
@@ -24,16 +26,29 @@ pub(in crate::nn) struct PackedKernel {
     places: Option<PackedWeights>,
     /// For tiles of places, of a convolution without a stride; largest tiles first.
     patches: Vec<PatchWeights>,
+    /// Of 8 bits, instead of the others.
+    bytes: Option<ByteKernel>,
 }
 
 impl PackedKernel {
     /// For images of any size: weights `[9 · C, O]` and a bias `[O]`.
-    pub(super) fn new(weights: &[f32], bias: &[f32], stride: usize) -> Self {
+    pub(super) fn new(weights: &[f32], bias: &[f32], stride: usize, precision: Precision) -> Self {
+        if precision == Precision::Int8 {
+            return Self {
+                outputs: bias.len(),
+                places: None,
+                patches: Vec::new(),
+                bytes: Some(ByteKernel::new(weights, bias)),
+            };
+        }
         let sizes = [TileSize::Four, TileSize::Two].into_iter().filter(|_| stride == 1);
         Self {
             outputs: bias.len(),
             places: Some(PackedWeights::new(weights, bias)),
-            patches: sizes.map(|size| PatchWeights::new(size, weights, bias)).collect(),
+            patches: sizes
+                .map(|size| PatchWeights::new(size, weights, bias, precision))
+                .collect(),
+            bytes: None,
         }
     }
 
@@ -45,8 +60,9 @@ impl PackedKernel {
             places: tiles.is_none().then(|| PackedWeights::new(weights, bias)),
             patches: tiles
                 .into_iter()
-                .map(|size| PatchWeights::new(size, weights, bias))
+                .map(|size| PatchWeights::new(size, weights, bias, Precision::F32))
                 .collect(),
+            bytes: None,
         }
     }
 
@@ -64,6 +80,29 @@ pub(super) enum Written<'a> {
     Modulated(&'a [f32]),
 }
 
+impl Written<'_> {
+    /// Writes neighbouring places `[places, channels]`.
+    #[inline(always)]
+    fn write(self, from: &[f32], to: &mut [f32], channels: usize) {
+        match self {
+            Written::Plain => to.copy_from_slice(from),
+            Written::Silu => {
+                for (to, &from) in to.iter_mut().zip(from) {
+                    *to = activate(from);
+                }
+            }
+            Written::Modulated(modulation) => {
+                let (scale, shift) = modulation.split_at(channels);
+                for (to, from) in to.chunks_exact_mut(channels).zip(from.chunks_exact(channels)) {
+                    for (((to, from), scale), shift) in to.iter_mut().zip(from).zip(scale).zip(shift) {
+                        *to = activate(from * (1.0 + scale) + shift);
+                    }
+                }
+            }
+        }
+    }
+}
+
 /// A convolution of images with a border of zeros.
 pub(super) struct BorderedConvolution<'a> {
     /// The rows that one thread computes, as an image.
@@ -75,6 +114,7 @@ pub(super) struct BorderedConvolution<'a> {
 enum Form<'a> {
     Tiles(TiledConvolution<'a>),
     Places(&'a PackedWeights, Vec<TapRun>),
+    Bytes(ByteConvolution<'a>),
 }
 
 impl<'a> BorderedConvolution<'a> {
@@ -85,6 +125,14 @@ impl<'a> BorderedConvolution<'a> {
 
     /// Computes each image in at most that many strips, on the threads of the pool that it is called in.
     pub(super) fn in_strips(packed: &'a PackedKernel, image: ImageGeometry, strips: usize) -> Self {
+        // A strip takes at least `LEAST_OF_STRIP` multiply–adds.
+        let strips = strips.min(image.places() * TAPS * image.channels * packed.outputs / LEAST_OF_STRIP);
+        if let Some(bytes) = &packed.bytes {
+            return Self {
+                strip: image,
+                form: Form::Bytes(ByteConvolution::new(bytes, image, strips)),
+            };
+        }
         let mut patches = packed.patches.iter();
         let patches = patches.find(|patches| patches.size().fits(image, packed.outputs));
         let places = || {
@@ -97,9 +145,8 @@ impl<'a> BorderedConvolution<'a> {
             Some(patches) => patches.size().side() * image.shape.dilation,
             None => image.shape.stride,
         };
-        let most = image.places() * TAPS * image.channels * packed.outputs / LEAST_OF_STRIP;
         // All have the same rows.
-        let strips = (2..=strips.min(most)).filter(|strips| image.height.is_multiple_of(strips * rows));
+        let strips = (2..=strips).filter(|strips| image.height.is_multiple_of(strips * rows));
         let strip = ImageGeometry {
             height: image.height / strips.max().unwrap_or(1),
             ..image
@@ -113,6 +160,15 @@ impl<'a> BorderedConvolution<'a> {
 
     /// Computes one item.
     pub(super) fn forward(&self, x: &[f32], out: &mut [f32], start: StartSums, written: Written) {
+        if let Form::Bytes(bytes) = &self.form {
+            return with_buffers([x.len(), 0, 0], |[activated, ..]| {
+                vectorized(
+                    #[inline(always)]
+                    || written.write(x, activated, self.strip.channels),
+                );
+                bytes.forward(activated, out, start);
+            });
+        }
         let length = self.strip.places() * self.outputs();
         if out.len() == length {
             return self.forward_strip(x, (0, out), start, written);
@@ -135,6 +191,7 @@ impl<'a> BorderedConvolution<'a> {
         match &self.form {
             Form::Tiles(tiled) => tiled.outputs(),
             Form::Places(places, _) => places.outputs(),
+            Form::Bytes(bytes) => bytes.outputs(),
         }
     }
 
@@ -149,7 +206,7 @@ impl<'a> BorderedConvolution<'a> {
     fn buffers(&self) -> [usize; 2] {
         match &self.form {
             Form::Tiles(tiled) => tiled.buffers(),
-            Form::Places(..) => [0; 2],
+            Form::Places(..) | Form::Bytes(_) => [0; 2],
         }
     }
 
@@ -158,6 +215,7 @@ impl<'a> BorderedConvolution<'a> {
         let (places, runs) = match &self.form {
             Form::Tiles(tiled) => return tiled.forward(bordered, buffers, out, start),
             Form::Places(places, runs) => (places, runs),
+            Form::Bytes(bytes) => return bytes.forward(bordered, out, StartSums::Bias),
         };
         let row_length = self.strip.out_width() * places.outputs();
         for (row, out) in out.chunks_exact_mut(row_length).enumerate() {
@@ -187,22 +245,7 @@ impl<'a> BorderedConvolution<'a> {
                     let (to, right) = to.split_at_mut(length);
                     left.fill(0.0);
                     right.fill(0.0);
-                    match written {
-                        Written::Plain => to.copy_from_slice(from),
-                        Written::Silu => {
-                            for (to, &from) in to.iter_mut().zip(from) {
-                                *to = activate(from);
-                            }
-                        }
-                        Written::Modulated(modulation) => {
-                            let (scale, shift) = modulation.split_at(channels);
-                            for (to, from) in to.chunks_exact_mut(channels).zip(from.chunks_exact(channels)) {
-                                for (((to, from), scale), shift) in to.iter_mut().zip(from).zip(scale).zip(shift) {
-                                    *to = activate(from * (1.0 + scale) + shift);
-                                }
-                            }
-                        }
-                    }
+                    written.write(from, to, channels);
                 }
             },
         );

@@ -13,6 +13,7 @@ use super::bordered_convolution::{BorderedConvolution, PackedKernel, Written};
 use super::image_geometry::{ConvShape, ImageGeometry, TAPS};
 use super::packed::StartSums;
 use crate::nn::fused::{FusedOperation, Operand, apply};
+use crate::nn::precision::Precision;
 use crate::nn::tensors::{product, sum_columns, with_values};
 
 /// A layer that is a 3×3 convolution of weight `[9 · C, O]`, taps row by row, and bias `[O]`.
@@ -27,10 +28,10 @@ pub(in crate::nn) struct Convolution3 {
 
 impl Convolution3 {
     /// Packs the weights as they are now.
-    pub(in crate::nn) fn pack(&mut self) -> Result<()> {
+    pub(in crate::nn) fn pack(&mut self, precision: Precision) -> Result<()> {
         let stride = self.shape.stride;
         let packed = with_values(&self.weight, |weights| {
-            with_values(&self.bias, |bias| PackedKernel::new(weights, bias, stride))
+            with_values(&self.bias, |bias| PackedKernel::new(weights, bias, stride, precision))
         })??;
         self.packed = Some(Arc::new(packed));
         Ok(())

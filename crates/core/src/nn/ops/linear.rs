@@ -9,8 +9,9 @@ use candle_core::{CpuStorage, Layout, Result, Shape, Tensor};
 use candle_nn::Module;
 
 use super::activation::tanh;
-use super::packed::PackedWeights;
+use super::row_weights::RowWeights;
 use crate::nn::fused::{FusedOperation, Operand, apply};
+use crate::nn::precision::Precision;
 use crate::nn::tensors::{add_columns, product, slice, sum_columns, with_values};
 use crate::vectorized::vectorized;
 
@@ -21,13 +22,13 @@ pub(in crate::nn) struct Linear {
     pub(in crate::nn) bias: Tensor,
     pub(in crate::nn) has_tanh: bool,
     /// For prediction, which then does not use the tensors.
-    pub(in crate::nn) packed: Option<Arc<PackedWeights>>,
+    pub(in crate::nn) packed: Option<Arc<RowWeights>>,
 }
 
 impl Linear {
-    /// Packs the weights of a layer without tanh as they are now.
-    pub(in crate::nn) fn pack(&mut self) -> Result<()> {
-        self.packed = Some(PackedWeights::of(&self.weight, &self.bias)?);
+    /// Packs the weights as they are now.
+    pub(in crate::nn) fn pack(&mut self, precision: Precision) -> Result<()> {
+        self.packed = Some(RowWeights::of(&self.weight, &self.bias, precision)?);
         Ok(())
     }
 }
@@ -35,15 +36,29 @@ impl Linear {
 impl Module for Linear {
     /// The layer's output `[N, O]` for x `[N, D]`, all f32.
     fn forward(&self, x: &Tensor) -> Result<Tensor> {
-        if let Some(packed) = self.packed.as_ref().filter(|_| !self.has_tanh) {
+        if let Some(packed) = &self.packed {
             let rows = x.dims2()?.0;
-            let mut out = vec![0.0; rows * packed.outputs()];
-            with_values(x, |x| packed.multiply_rows(x, &mut out))?;
+            let mut out = with_values(x, |x| packed.times(x, rows))?;
+            if self.has_tanh {
+                tanh_all(&mut out);
+            }
             return Tensor::from_vec(out, (rows, packed.outputs()), x.device());
         }
         let has_tanh = self.has_tanh;
         apply(FusedLinear { has_tanh }, [x, &self.weight, &self.bias])
     }
+}
+
+/// The tanh of each value, in place.
+fn tanh_all(values: &mut [f32]) {
+    vectorized(
+        #[inline(always)]
+        || {
+            for value in values {
+                *value = tanh(*value);
+            }
+        },
+    );
 }
 
 /// The layer at each place of a grid `[M, h, w, D]`.

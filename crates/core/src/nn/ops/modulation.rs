@@ -7,7 +7,7 @@ use candle_nn::Module as _;
 
 use super::activation::sigmoid;
 use super::linear::Linear;
-use super::packed::PackedWeights;
+use super::row_weights::RowWeights;
 use crate::nn::fused::{FusedOperation, Operand, apply};
 use crate::nn::tensors::with_values;
 use crate::vectorized::vectorized;
@@ -43,7 +43,7 @@ pub(in crate::nn) fn perceptron(layers: &[Linear], x: &Tensor) -> Result<Tensor>
 /// Rows that go through all layers together, so that what is between the layers stays in the fastest cache.
 const ROWS_TOGETHER: usize = 64;
 
-fn packed_perceptron(layers: &[&PackedWeights], x: &[f32], rows: usize) -> Vec<f32> {
+fn packed_perceptron(layers: &[&RowWeights], x: &[f32], rows: usize) -> Vec<f32> {
     let outputs = layers.last().map_or(0, |last| last.outputs());
     let inputs = x.len() / rows.max(1);
     let mut out = vec![0.0; rows * outputs];

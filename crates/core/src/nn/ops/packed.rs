@@ -4,12 +4,7 @@
 // A closure's vector instructions reach what is inlined into it, and only that.
 #![allow(clippy::inline_always)]
 
-use std::sync::Arc;
-
-use candle_core::{Result, Tensor};
 use pulp::{Arch, Simd, WithSimd};
-
-use crate::nn::tensors::with_values;
 
 /// Most vectors of outputs whose sums are kept in registers together.
 const MAX_VECTORS: usize = 3;
@@ -89,12 +84,6 @@ impl PackedWeights {
             outputs,
             panels: (0..panels).map(panel).collect(),
         }
-    }
-
-    /// Packs the weights and the bias of a layer as they are now.
-    pub(in crate::nn) fn of(weight: &Tensor, bias: &Tensor) -> Result<Arc<Self>> {
-        let packed = with_values(weight, |weights| with_values(bias, |bias| Self::new(weights, bias)))??;
-        Ok(Arc::new(packed))
     }
 
     pub(in crate::nn) fn outputs(&self) -> usize {

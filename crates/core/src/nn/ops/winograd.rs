@@ -8,7 +8,9 @@
 mod transforms;
 
 use super::image_geometry::{ImageGeometry, TAPS};
-use super::packed::{PackedWeights, StartSums, lanes};
+use super::packed::{StartSums, lanes};
+use super::row_weights::RowWeights;
+use crate::nn::precision::Precision;
 use transforms::{transformed_taps, write_outputs, write_patches};
 
 /// Tiles that are computed together, so that what lies between the steps stays in the processor's cache.
@@ -58,7 +60,7 @@ pub(super) struct PatchWeights {
     /// Filled up with zeros to whole vectors, as the outputs of the matrices are.
     bias: Vec<f32>,
     /// One `[C, bias.len()]` for each value of a patch.
-    matrices: Vec<PackedWeights>,
+    matrices: Vec<RowWeights>,
 }
 
 /// Where a tile lies, in values.
@@ -79,7 +81,7 @@ pub(super) struct TiledConvolution<'a> {
 
 impl PatchWeights {
     /// Of weights `[9 · C, O]` and a bias `[O]`.
-    pub(super) fn new(size: TileSize, weights: &[f32], bias: &[f32]) -> Self {
+    pub(super) fn new(size: TileSize, weights: &[f32], bias: &[f32], precision: Precision) -> Self {
         let (outputs, side) = (bias.len(), size.patch_side());
         let mut filled_bias = bias.to_vec();
         filled_bias.resize(outputs.next_multiple_of(lanes()), 0.0);
@@ -107,7 +109,7 @@ impl PatchWeights {
             bias: filled_bias,
             matrices: matrices
                 .iter()
-                .map(|matrix| PackedWeights::new(matrix, &none))
+                .map(|matrix| RowWeights::new(matrix, &none, precision))
                 .collect(),
         }
     }
@@ -207,7 +209,7 @@ mod tests {
             for (row, values) in x.chunks_exact(width * channels).enumerate() {
                 bordered[image.inside() + row * image.pitch() * channels..][..values.len()].copy_from_slice(values);
             }
-            let weights_of_patches = PatchWeights::new(size, &weights, &bias);
+            let weights_of_patches = PatchWeights::new(size, &weights, &bias, Precision::F32);
             assert!(size.fits(image, outputs));
             let tiled = TiledConvolution::new(&weights_of_patches, image);
             let held = values(height * width * outputs, 4);

@@ -1,0 +1,383 @@
+//! Products with weights of 16 or 8 bits, by instructions that multiply neighbouring inputs of a place at once and add up what they
+//! give: two of bfloat16, or four whole numbers. Such neighbours are a group, of 32 bits.
+//!
+//! Whole numbers: x = scale · (byte − zero), with one scale and zero for a row or an image, so that 0 is exact; w = factor · byte, with
+//! one factor for each output. A sum of products of bytes is exact. It becomes scale · factor · (Σ x w − zero · Σ w).
+// A closure's vector instructions reach what is inlined into it, and only that.
+#![allow(clippy::inline_always)]
+
+#[cfg(target_arch = "x86_64")]
+mod x86;
+
+use super::packed::{StartSums, TapRun};
+use super::scratch::with_groups;
+use crate::nn::precision::Precision;
+use crate::vectorized::vectorized;
+
+/// Outputs whose sums are computed together.
+const LANES: usize = 16;
+/// Most vectors of outputs whose sums are kept in registers together.
+const MAX_VECTORS: usize = 3;
+/// The largest byte of a weight.
+const MOST_OF_WEIGHT: f32 = 127.0;
+/// The largest byte of an input.
+const MOST_OF_INPUT: f32 = 255.0;
+
+/// Neighbouring inputs of a place.
+pub(super) type Group = [u8; 4];
+
+/// A vector of 512 bits.
+#[derive(Clone, Copy, Debug)]
+#[repr(C, align(64))]
+struct Lanes<T>([T; LANES]);
+
+/// Weights and a bias.
+#[derive(Debug)]
+pub(in crate::nn) struct ReducedWeights {
+    outputs: usize,
+    precision: Precision,
+    panels: Vec<OutputPanel>,
+}
+
+/// The weights of neighbouring outputs, filled up with zeros to whole vectors.
+#[derive(Debug)]
+struct OutputPanel {
+    /// The first of them.
+    first: usize,
+    /// Vectors of a group's weights.
+    vectors: usize,
+    /// `[groups, vectors]`.
+    weights: Vec<Lanes<Group>>,
+    /// `[vectors]` each: of whole numbers, the factors and the sums of the weights.
+    factors: Vec<Lanes<f32>>,
+    weight_sums: Vec<Lanes<i32>>,
+    bias: Vec<Lanes<f32>>,
+}
+
+/// The groups of neighbouring places.
+#[derive(Clone, Copy)]
+pub(super) struct PlaceGroups<'a> {
+    pub(super) groups: &'a [Group],
+    /// Groups from one place's beginning to the next one's.
+    pub(super) step: usize,
+    /// What each place reads, in groups.
+    pub(super) runs: &'a [TapRun],
+    /// Of whole numbers: one for each place, or one for all.
+    pub(super) ranges: &'a [ByteRange],
+}
+
+/// Which numbers bytes stand for.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct ByteRange {
+    pub(super) scale: f32,
+    pub(super) zero: u8,
+}
+
+/// What one call computes.
+struct Product<'a> {
+    weights: &'a ReducedWeights,
+    inputs: PlaceGroups<'a>,
+    out: &'a mut [f32],
+    start: StartSums,
+}
+
+impl ReducedWeights {
+    /// Packs weights `[inputs, outputs]` and a bias `[outputs]`. The inputs are runs of that many, each filled up to whole groups.
+    pub(super) fn new(weights: &[f32], bias: &[f32], run: usize, precision: Precision) -> Self {
+        let outputs = bias.len();
+        let vectors = outputs.div_ceil(LANES);
+        let panels = vectors.div_ceil(MAX_VECTORS);
+        let panel = |index: usize| {
+            // As equal as possible.
+            let [from, to] = [index, index + 1].map(|index| index * vectors / panels);
+            OutputPanel::new(weights, bias, [from, to], run, precision)
+        };
+        Self {
+            outputs,
+            precision,
+            panels: (0..panels).map(panel).collect(),
+        }
+    }
+
+    pub(super) fn outputs(&self) -> usize {
+        self.outputs
+    }
+
+    /// Writes the sums of each place to `out` `[places, outputs]`. Without the instructions, it does not compute anything: the precision
+    /// cannot be chosen then.
+    pub(super) fn multiply(&self, inputs: PlaceGroups, out: &mut [f32], start: StartSums) {
+        let product = Product {
+            weights: self,
+            inputs,
+            out,
+            start,
+        };
+        #[cfg(target_arch = "x86_64")]
+        x86::multiply(product);
+        #[cfg(not(target_arch = "x86_64"))]
+        drop(product);
+    }
+
+    /// The sums of rows `[rows, inputs]` without neighbours.
+    pub(super) fn multiply_rows(&self, rows: &[f32], out: &mut [f32]) {
+        let count = (out.len() / self.outputs).max(1);
+        let (inputs, length) = (rows.len() / count, (rows.len() / count).div_ceil(inputs_of_group(self.precision)));
+        let runs = [TapRun {
+            offset: 0,
+            first: 0,
+            length,
+        }];
+        with_groups(count * length, |groups| {
+            let mut ranges = Vec::new();
+            match self.precision {
+                Precision::Int8 => {
+                    for (row, groups) in rows.chunks_exact(inputs).zip(groups.chunks_exact_mut(length)) {
+                        let range = ByteRange::of(row);
+                        range.write(row, inputs, groups);
+                        ranges.push(range);
+                    }
+                }
+                Precision::F32 | Precision::Bf16 => write_halves(rows, inputs, groups),
+            }
+            let inputs = PlaceGroups {
+                groups,
+                step: length,
+                runs: &runs,
+                ranges: &ranges,
+            };
+            self.multiply(inputs, out, StartSums::Bias);
+        });
+    }
+}
+
+impl OutputPanel {
+    fn new(weights: &[f32], bias: &[f32], [from, to]: [usize; 2], run: usize, precision: Precision) -> Self {
+        let outputs = bias.len();
+        let weight = |input: usize, output: usize| {
+            let row = weights.chunks_exact(outputs).nth(input);
+            row.and_then(|row| row.get(output)).copied().unwrap_or(0.0)
+        };
+        let inputs = weights.len() / outputs;
+        let lanes = |vector: usize| (from + vector) * LANES..(from + vector + 1) * LANES;
+        let of_outputs = |value: &dyn Fn(usize) -> f32| -> Vec<Lanes<f32>> {
+            let vector = |vector| {
+                let first = lanes(vector).start;
+                Lanes(std::array::from_fn(|lane| value(first + lane)))
+            };
+            (0..to - from).map(vector).collect()
+        };
+        let factors = of_outputs(&|output| {
+            let largest = (0..inputs).fold(0.0f32, |most, input| most.max(weight(input, output).abs()));
+            if largest > 0.0 { largest / MOST_OF_WEIGHT } else { 1.0 }
+        });
+        let size = inputs_of_group(precision);
+        let mut sums = vec![Lanes([0; LANES]); to - from];
+        let mut packed = Vec::new();
+        for first in (0..inputs).step_by(run.max(1)) {
+            for group in (0..run).step_by(size) {
+                for (vector, sums) in sums.iter_mut().enumerate() {
+                    let mut groups = Lanes([[0; 4]; LANES]);
+                    for (lane, output) in lanes(vector).enumerate() {
+                        // A run's end has no weights of the next one.
+                        let value = |at: usize| if group + at < run { weight(first + group + at, output) } else { 0.0 };
+                        groups.0[lane] = if precision == Precision::Int8 {
+                            let bytes = [0, 1, 2, 3].map(|at| (value(at) / factors[vector].0[lane]).round() as i8);
+                            sums.0[lane] += bytes.iter().map(|byte| i32::from(*byte)).sum::<i32>();
+                            bytes.map(i8::cast_unsigned)
+                        } else {
+                            {
+                            let [low, high] = [0, 1].map(|at| bfloat(value(at)).to_le_bytes());
+                            [low[0], low[1], high[0], high[1]]
+                        }
+                        };
+                    }
+                    packed.push(groups);
+                }
+            }
+        }
+        Self {
+            first: from * LANES,
+            vectors: to - from,
+            weights: packed,
+            factors,
+            weight_sums: sums,
+            bias: of_outputs(&|output| bias.get(output).copied().unwrap_or(0.0)),
+        }
+    }
+}
+
+impl ByteRange {
+    /// That of these values and of 0.
+    pub(super) fn of(values: &[f32]) -> Self {
+        /// Several vectors, so that none waits for the one before.
+        const TOGETHER: usize = 4 * LANES;
+        let (mut least, mut most) = ([0.0f32; TOGETHER], [0.0f32; TOGETHER]);
+        vectorized(
+            #[inline(always)]
+            || {
+                let (whole, rest) = values.as_chunks::<TOGETHER>();
+                for values in whole {
+                    widen(&mut least, &mut most, values);
+                }
+                widen(&mut least, &mut most, rest);
+            },
+        );
+        let (least, most) = (least.into_iter().fold(0.0, f32::min), most.into_iter().fold(0.0, f32::max));
+        let scale = (most - least) / MOST_OF_INPUT;
+        if scale.is_normal() {
+            let zero = (-least / scale).round() as u8;
+            Self { scale, zero }
+        } else {
+            Self { scale: 1.0, zero: 0 }
+        }
+    }
+
+    /// Writes places `[places, channels]` as bytes; the last group of each is filled up with what stands for 0.
+    pub(super) fn write(self, values: &[f32], channels: usize, groups: &mut [Group]) {
+        let length = channels.div_ceil(inputs_of_group(Precision::Int8)) * size_of::<Group>();
+        let to = groups.as_flattened_mut();
+        vectorized(
+            #[inline(always)]
+            || {
+                if length == channels {
+                    return self.write_bytes(values, to);
+                }
+                for (values, to) in values.chunks_exact(channels).zip(to.chunks_exact_mut(length)) {
+                    let (to, rest) = to.split_at_mut(channels);
+                    self.write_bytes(values, to);
+                    rest.fill(self.zero);
+                }
+            },
+        );
+    }
+
+    #[inline(always)]
+    fn write_bytes(self, values: &[f32], to: &mut [u8]) {
+        /// After adding 2^23, the low bits hold the nearest whole number.
+        const ROUND: f32 = 8_388_608.0;
+        let (factor, first) = (self.scale.recip(), ROUND + f32::from(self.zero));
+        for (to, value) in to.iter_mut().zip(values) {
+            let shifted = (value * factor + first).max(ROUND).min(ROUND + MOST_OF_INPUT);
+            *to = shifted.to_bits() as u8;
+        }
+    }
+}
+
+/// Widens the ranges of lanes.
+#[inline(always)]
+fn widen(least: &mut [f32], most: &mut [f32], values: &[f32]) {
+    for ((least, most), &value) in least.iter_mut().zip(most).zip(values) {
+        *least = if value < *least { value } else { *least };
+        *most = if value > *most { value } else { *most };
+    }
+}
+
+/// Inputs of a group.
+pub(super) fn inputs_of_group(precision: Precision) -> usize {
+    if precision == Precision::Int8 { 4 } else { 2 }
+}
+
+/// Writes rows `[rows, inputs]` as bfloat16; the last group of each is filled up with a zero.
+fn write_halves(rows: &[f32], inputs: usize, groups: &mut [Group]) {
+    let length = inputs.next_multiple_of(inputs_of_group(Precision::Bf16));
+    let to = groups.as_flattened_mut().as_chunks_mut::<2>().0;
+    vectorized(
+        #[inline(always)]
+        || {
+            if length == inputs {
+                return write_bfloats(rows, to);
+            }
+            for (row, to) in rows.chunks_exact(inputs).zip(to.chunks_exact_mut(length)) {
+                write_bfloats(row, to);
+                to[inputs..].fill([0; 2]);
+            }
+        },
+    );
+}
+
+#[inline(always)]
+fn write_bfloats(values: &[f32], to: &mut [[u8; 2]]) {
+    for (to, value) in to.iter_mut().zip(values) {
+        *to = bfloat(*value).to_le_bytes();
+    }
+}
+
+/// A value as bfloat16, rounded to the nearest, ties to even.
+#[inline(always)]
+fn bfloat(value: f32) -> u16 {
+    let bits = value.to_bits();
+    (bits.wrapping_add(0x7fff + (bits >> 16 & 1)) >> 16) as u16
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::nn::gradient_check::noise;
+
+    fn values(count: usize, seed: u64) -> Vec<f32> {
+        noise(&[count], seed).to_vec1().unwrap()
+    }
+
+    /// What a value becomes in bfloat16.
+    fn half(value: f32) -> f32 {
+        f32::from_bits(u32::from(bfloat(value)) << 16)
+    }
+
+    #[test]
+    fn products_are_those_of_the_rounded_numbers() {
+        for precision in [Precision::Bf16, Precision::Int8] {
+            if !precision.is_supported() {
+                eprintln!("skipped: this processor does not multiply {precision}");
+                continue;
+            }
+            for (rows, inputs, outputs) in [(1, 3, 1), (13, 20, 12), (8, 7, 16), (30, 33, 48), (5, 9, 50), (3, 4, 129)] {
+                let (x, weights, bias) = (values(rows * inputs, 1), values(inputs * outputs, 2), values(outputs, 3));
+                let mut out = vec![7.0; rows * outputs];
+                ReducedWeights::new(&weights, &bias, inputs, precision).multiply_rows(&x, &mut out);
+                for (index, found) in out.iter().enumerate() {
+                    let (row, output) = (index / outputs, index % outputs);
+                    let row = &x[row * inputs..(row + 1) * inputs];
+                    let column: Vec<f32> = (0..inputs).map(|input| weights[input * outputs + output]).collect();
+                    let (row, column) = match precision {
+                        Precision::Int8 => (of_bytes(row), of_weight_bytes(&column)),
+                        _ => [row, &column].map(|values| values.iter().map(|value| half(*value)).collect()).into(),
+                    };
+                    let expected = bias[output] + row.iter().zip(&column).map(|(x, w)| x * w).sum::<f32>();
+                    assert!((found - expected).abs() < 2e-5, "{precision}: {found} {expected}");
+                }
+            }
+        }
+    }
+
+    /// The values that a row's bytes stand for.
+    fn of_bytes(row: &[f32]) -> Vec<f32> {
+        let range = ByteRange::of(row);
+        let mut groups = vec![[0; 4]; row.len().div_ceil(4)];
+        range.write(row, row.len(), &mut groups);
+        let bytes = groups.as_flattened()[..row.len()].iter();
+        bytes.map(|byte| (f32::from(*byte) - f32::from(range.zero)) * range.scale).collect()
+    }
+
+    fn of_weight_bytes(column: &[f32]) -> Vec<f32> {
+        let factor = column.iter().fold(0.0f32, |most, weight| most.max(weight.abs())) / MOST_OF_WEIGHT;
+        column.iter().map(|weight| (weight / factor).round() * factor).collect()
+    }
+
+    #[test]
+    fn bytes_stand_for_nearly_the_same_values() {
+        for row in [&[0.0; 5][..], &[-1.0, 2.5, 0.3, 1e-3, 0.0, 2.4999], &[3.0, 7.0], &[-0.1; 7]] {
+            let scale = ByteRange::of(row).scale;
+            for (found, value) in of_bytes(row).into_iter().zip(row) {
+                assert!((found - value).abs() <= 0.5001 * scale, "{row:?}: {found} {value}");
+                assert!(*value != 0.0 || found == 0.0, "{row:?}: {found}");
+            }
+        }
+    }
+
+    #[test]
+    fn halves_are_the_nearest() {
+        for (value, expected) in [(1.0, 1.0), (1.003, 1.0), (1.005, 1.0078125), (-3.3, -3.296875), (0.0, 0.0)] {
+            assert_eq!(half(value), expected);
+        }
+    }
+}

@@ -1,0 +1,135 @@
+//! The precision of products with weights in predictions. The program chooses it once, when it starts; without a choice it is single
+//! precision. Trainings, and predictions on a graphics card, are always in single precision.
+
+use std::fmt;
+use std::str::FromStr;
+use std::sync::OnceLock;
+
+use serde::{Deserialize, Serialize};
+
+use super::error::NnError;
+
+/// The chosen precision.
+static CHOSEN: OnceLock<Precision> = OnceLock::new();
+
+/// In which numbers predictions multiply inputs with weights. Sums, and all else, are in single precision.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(try_from = "String", into = "String")]
+pub enum Precision {
+    /// Single precision, 32 bits.
+    #[default]
+    F32,
+    /// bfloat16: 16 bits, of which 8 are the exponent.
+    Bf16,
+    /// Whole numbers of 8 bits with factors: one for each output of the weights, and one for each item of the inputs.
+    Int8,
+}
+
+impl Precision {
+    /// All, from the most to the fewest bits.
+    pub const ALL: [Self; 3] = [Self::F32, Self::Bf16, Self::Int8];
+
+    /// Whether this processor multiplies such numbers. For bf16 and int8 it must have instructions for it: without them, these would be
+    /// slower than single precision.
+    #[must_use]
+    pub fn is_supported(self) -> bool {
+        match self {
+            Self::F32 => true,
+            #[cfg(target_arch = "x86_64")]
+            Self::Bf16 => is_x86_feature_detected!("avx512f") && is_x86_feature_detected!("avx512bf16"),
+            #[cfg(target_arch = "x86_64")]
+            Self::Int8 => is_x86_feature_detected!("avx512f") && is_x86_feature_detected!("avx512vnni"),
+            #[cfg(not(target_arch = "x86_64"))]
+            Self::Bf16 | Self::Int8 => false,
+        }
+    }
+
+    /// That of layers with few inputs, where it takes as long to find the scale of whole numbers as to multiply them.
+    pub(super) fn of_few_inputs(self) -> Self {
+        match self {
+            Self::Int8 if Self::Bf16.is_supported() => Self::Bf16,
+            Self::Int8 => Self::F32,
+            Self::F32 | Self::Bf16 => self,
+        }
+    }
+
+    /// What a processor needs for it.
+    fn instructions(self) -> &'static str {
+        match self {
+            Self::F32 => "",
+            Self::Bf16 => "AVX-512 BF16",
+            Self::Int8 => "AVX-512 VNNI",
+        }
+    }
+}
+
+impl fmt::Display for Precision {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::F32 => "f32",
+            Self::Bf16 => "bf16",
+            Self::Int8 => "int8",
+        })
+    }
+}
+
+impl FromStr for Precision {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let named = Self::ALL.into_iter().find(|precision| precision.to_string() == text);
+        named.ok_or_else(|| format!("unknown precision \"{text}\"; a precision is \"f32\", \"bf16\" or \"int8\""))
+    }
+}
+
+impl TryFrom<String> for Precision {
+    type Error = String;
+
+    fn try_from(text: String) -> Result<Self, String> {
+        text.parse()
+    }
+}
+
+impl From<Precision> for String {
+    fn from(precision: Precision) -> Self {
+        precision.to_string()
+    }
+}
+
+/// Makes all models that are loaded from now on predict with it. Errors: `Precision` if this processor cannot, or another precision was
+/// chosen before.
+pub fn choose(precision: Precision) -> Result<(), NnError> {
+    let refused = |reason| NnError::Precision { precision, reason };
+    if !precision.is_supported() {
+        let instructions = precision.instructions();
+        return Err(refused(format!(
+            "this processor has no {instructions}; use \"f32\", which every processor has"
+        )));
+    }
+    let chosen = *CHOSEN.get_or_init(|| precision);
+    if chosen != precision {
+        return Err(refused(format!("this process already predicts in \"{chosen}\"")));
+    }
+    Ok(())
+}
+
+/// The precision of models that are loaded now.
+#[must_use]
+pub fn current() -> Precision {
+    CHOSEN.get().copied().unwrap_or_default()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_precision_has_a_name() {
+        for precision in Precision::ALL {
+            assert_eq!(precision.to_string().parse(), Ok(precision));
+        }
+        for wrong in ["fp32", "INT8", "int4", ""] {
+            assert!(wrong.parse::<Precision>().unwrap_err().contains(wrong));
+        }
+    }
+}
