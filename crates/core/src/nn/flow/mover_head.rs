@@ -26,8 +26,8 @@ impl MoverHead {
 
     /// Packs the layers' weights for prediction.
     pub(super) fn pack(&mut self, precision: Precision) -> Result<(), NnError> {
-        self.seen.pack(precision)?;
-        Ok(self.coming.pack(precision)?)
+        self.seen.pack(precision.of_few_inputs())?;
+        Ok(self.coming.pack(precision.of_few_inputs())?)
     }
 
     /// Where they are in the last frames `[contexts, P]`, from the encoder's features.

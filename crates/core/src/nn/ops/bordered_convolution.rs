@@ -161,6 +161,9 @@ impl<'a> BorderedConvolution<'a> {
     /// Computes one item.
     pub(super) fn forward(&self, x: &[f32], out: &mut [f32], start: StartSums, written: Written) {
         if let Form::Bytes(bytes) = &self.form {
+            if matches!(written, Written::Plain) {
+                return bytes.forward(x, out, start);
+            }
             return with_buffers([x.len(), 0, 0], |[activated, ..]| {
                 vectorized(
                     #[inline(always)]

@@ -209,20 +209,10 @@ impl OutputPanel {
 impl ByteRange {
     /// That of these values and of 0.
     pub(super) fn of(values: &[f32]) -> Self {
-        /// Several vectors, so that none waits for the one before.
-        const TOGETHER: usize = 4 * LANES;
-        let (mut least, mut most) = ([0.0f32; TOGETHER], [0.0f32; TOGETHER]);
-        vectorized(
-            #[inline(always)]
-            || {
-                let (whole, rest) = values.as_chunks::<TOGETHER>();
-                for values in whole {
-                    widen(&mut least, &mut most, values);
-                }
-                widen(&mut least, &mut most, rest);
-            },
-        );
-        let (least, most) = (least.into_iter().fold(0.0, f32::min), most.into_iter().fold(0.0, f32::max));
+        #[cfg(target_arch = "x86_64")]
+        let (least, most) = x86::extremes(values);
+        #[cfg(not(target_arch = "x86_64"))]
+        let (least, most) = values.iter().fold((0.0f32, 0.0f32), |(least, most), &value| (least.min(value), most.max(value)));
         let scale = (most - least) / MOST_OF_INPUT;
         if scale.is_normal() {
             let zero = (-least / scale).round() as u8;
@@ -260,15 +250,6 @@ impl ByteRange {
             let shifted = (value * factor + first).max(ROUND).min(ROUND + MOST_OF_INPUT);
             *to = shifted.to_bits() as u8;
         }
-    }
-}
-
-/// Widens the ranges of lanes.
-#[inline(always)]
-fn widen(least: &mut [f32], most: &mut [f32], values: &[f32]) {
-    for ((least, most), &value) in least.iter_mut().zip(most).zip(values) {
-        *least = if value < *least { value } else { *least };
-        *most = if value > *most { value } else { *most };
     }
 }
 
