@@ -203,5 +203,8 @@ fn a_precision_is_named_and_another_one_than_the_first_is_refused_with_its_sourc
     // Another one was chosen above, or this processor cannot.
     let loaded = LoadedConfig::from_layers(set("precision=int8")).unwrap();
     let error = loaded.choose_computation().unwrap_err().to_string();
-    assert!(error.starts_with("precision is \"int8\" (--set): this process"), "{error}");
+    assert!(
+        error.starts_with("precision is \"int8\" (--set): this process"),
+        "{error}"
+    );
 }

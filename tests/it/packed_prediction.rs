@@ -3,8 +3,8 @@
 use std::path::Path;
 
 use candle_core::{Device, Tensor};
-use foreframe_core::nn::{ChannelScale, ConditioningTensors, ModelSpec, Network};
 use foreframe_core::nn::precision::Precision;
+use foreframe_core::nn::{ChannelScale, ConditioningTensors, ModelSpec, Network};
 use foreframe_core::registry;
 
 use crate::nn_fixtures::{largest_difference, values};
@@ -99,12 +99,17 @@ fn fewer_bits_predict_nearly_the_same() {
 #[test]
 fn many_plans_give_the_bits_that_each_alone_gives() {
     let networks = ["moving-flow", "rooms", "home"].map(packed).into_iter();
-    let in_fewer_bits = [Precision::Bf16, Precision::Int8].into_iter().filter(|precision| precision.is_supported());
-    let in_fewer_bits = in_fewer_bits.flat_map(|precision| ["moving", "rooms"].map(|name| in_precision(name, precision)));
+    let in_fewer_bits = [Precision::Bf16, Precision::Int8]
+        .into_iter()
+        .filter(|precision| precision.is_supported());
+    let in_fewer_bits =
+        in_fewer_bits.flat_map(|precision| ["moving", "rooms"].map(|name| in_precision(name, precision)));
     for network in networks.chain(in_fewer_bits) {
         let spec = network.spec();
         let plans = plans(spec, 21);
-        let frames = network.encode_frames(&frames(spec, 1).reshape((spec.context, ())).unwrap()).unwrap();
+        let frames = network
+            .encode_frames(&frames(spec, 1).reshape((spec.context, ())).unwrap())
+            .unwrap();
         let frames = frames.reshape((1, spec.context, ())).unwrap();
         let together = network.predict_rollouts(&frames, &[0; 21], &plans).unwrap();
         for plan in [0, 7, 20] {
@@ -115,7 +120,12 @@ fn many_plans_give_the_bits_that_each_alone_gives() {
                 ..ConditioningTensors::none()
             };
             let alone = network.predict_rollouts(&frames, &[0], &own).unwrap();
-            assert_eq!(largest_difference(&alone, &row(&together)), 0.0, "{:?}", spec.architecture);
+            assert_eq!(
+                largest_difference(&alone, &row(&together)),
+                0.0,
+                "{:?}",
+                spec.architecture
+            );
         }
     }
 }

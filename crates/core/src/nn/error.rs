@@ -184,7 +184,9 @@ impl HasErrorKind for NnError {
     fn kind(&self) -> ErrorKind {
         match self {
             // These come from settings.
-            Self::OutOfRange { .. } | Self::NoChannels { .. } | Self::Device { .. } | Self::Precision { .. } => ErrorKind::Usage,
+            Self::OutOfRange { .. } | Self::NoChannels { .. } | Self::Device { .. } | Self::Precision { .. } => {
+                ErrorKind::Usage
+            }
             Self::Tensor(_) => ErrorKind::Internal,
             _ => ErrorKind::Unusable,
         }

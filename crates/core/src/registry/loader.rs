@@ -51,7 +51,8 @@ pub struct StoredWeights {
 /// `Weights`, `Device`.
 pub fn load(model_dir: &Path) -> Result<Model, RegistryError> {
     let StoredWeights { manifest, parameters } = load_weights(model_dir)?;
-    let network = Network::detached(manifest.spec.clone(), &parameters).and_then(|network| network.packed(precision::current()));
+    let network =
+        Network::detached(manifest.spec.clone(), &parameters).and_then(|network| network.packed(precision::current()));
     let network = network.map_err(|source| match source {
         NnError::Device { .. } => RegistryError::Device(source),
         _ => RegistryError::Weights {

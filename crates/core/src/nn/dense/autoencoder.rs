@@ -68,7 +68,11 @@ impl DenseNetwork {
         if precision == Precision::F32 || self.layers == LayerForm::Plain {
             return Ok(());
         }
-        for layer in [&mut self.frame_encoder, &mut self.frame_decoder, &mut self.predictor_output] {
+        for layer in [
+            &mut self.frame_encoder,
+            &mut self.frame_decoder,
+            &mut self.predictor_output,
+        ] {
             layer.pack(precision)?;
         }
         self.encoder.pack(0, precision)?;

@@ -25,7 +25,11 @@ pub fn unroll(cell: &PeepholeCell, x: &Tensor, state: &LstmState) -> Result<(Ten
 fn input_projection(cell: &PeepholeCell, x: &Tensor, first_row: usize) -> Result<Tensor, NnError> {
     let rows = x.transpose(0, 1)?.contiguous()?.flatten(0, 1)?;
     // In a decoder with teacher forcing, all inputs are known.
-    if let Some(packed) = cell.packed.as_ref().filter(|packed| packed.fed_back.is_some() == (first_row > 0)) {
+    if let Some(packed) = cell
+        .packed
+        .as_ref()
+        .filter(|packed| packed.fed_back.is_some() == (first_row > 0))
+    {
         let count = rows.dim(0)?;
         let sums = with_values(&rows, |rows| packed.projection.times(rows, count))?;
         return Ok(Tensor::from_vec(sums, (count, ()), x.device())?);

@@ -120,7 +120,10 @@ mod tests {
                 for (plain, packed) in plain.iter().flatten().zip(outputs(&layer).iter().flatten()) {
                     assert_eq!(plain.dims(), packed.dims());
                     let most = (plain - packed).unwrap().abs().unwrap().max_all().unwrap();
-                    assert!(most.to_scalar::<f32>().unwrap() < bound, "{shape:?}, {precision}: {most}");
+                    assert!(
+                        most.to_scalar::<f32>().unwrap() < bound,
+                        "{shape:?}, {precision}: {most}"
+                    );
                 }
             }
         }

@@ -88,7 +88,9 @@ impl<'a> ByteConvolution<'a> {
 
     /// Writes an item with its border.
     fn write(&self, activated: &[f32], range: ByteRange, groups: &mut [Group]) {
-        let ImageGeometry { width, channels, shape, .. } = self.grouped;
+        let ImageGeometry {
+            width, channels, shape, ..
+        } = self.grouped;
         let row = self.grouped.pitch() * channels;
         let (above, rest) = groups.split_at_mut(shape.dilation * row);
         above.fill([range.zero; 4]);

@@ -103,8 +103,7 @@ impl ReducedWeights {
         self.outputs
     }
 
-    /// Writes the sums of each place to `out` `[places, outputs]`. Without the instructions, it does not compute anything: the precision
-    /// cannot be chosen then.
+    /// Writes the sums of each place to `out` `[places, outputs]`. A processor without the instructions is a bug.
     pub(super) fn multiply(&self, inputs: PlaceGroups, out: &mut [f32], start: StartSums) {
         let product = Product {
             weights: self,
@@ -115,13 +114,14 @@ impl ReducedWeights {
         #[cfg(target_arch = "x86_64")]
         x86::multiply(product);
         #[cfg(not(target_arch = "x86_64"))]
-        drop(product);
+        unreachable!("{} weights on this processor are a bug", product.weights.precision);
     }
 
     /// The sums of rows `[rows, inputs]` without neighbours.
     pub(super) fn multiply_rows(&self, rows: &[f32], out: &mut [f32]) {
         let count = (out.len() / self.outputs).max(1);
-        let (inputs, length) = (rows.len() / count, (rows.len() / count).div_ceil(inputs_of_group(self.precision)));
+        let inputs = rows.len() / count;
+        let length = inputs.div_ceil(inputs_of_group(self.precision));
         let runs = [TapRun {
             offset: 0,
             first: 0,
@@ -170,25 +170,28 @@ impl OutputPanel {
             let largest = (0..inputs).fold(0.0f32, |most, input| most.max(weight(input, output).abs()));
             if largest > 0.0 { largest / MOST_OF_WEIGHT } else { 1.0 }
         });
-        let size = inputs_of_group(precision);
-        let mut sums = vec![Lanes([0; LANES]); to - from];
+        let mut weight_sums = vec![Lanes([0; LANES]); to - from];
         let mut packed = Vec::new();
         for first in (0..inputs).step_by(run.max(1)) {
-            for group in (0..run).step_by(size) {
-                for (vector, sums) in sums.iter_mut().enumerate() {
+            for group in (0..run).step_by(inputs_of_group(precision)) {
+                for (vector, sums) in weight_sums.iter_mut().enumerate() {
                     let mut groups = Lanes([[0; 4]; LANES]);
                     for (lane, output) in lanes(vector).enumerate() {
                         // A run's end has no weights of the next one.
-                        let value = |at: usize| if group + at < run { weight(first + group + at, output) } else { 0.0 };
-                        groups.0[lane] = if precision == Precision::Int8 {
-                            let bytes = [0, 1, 2, 3].map(|at| (value(at) / factors[vector].0[lane]).round() as i8);
-                            sums.0[lane] += bytes.iter().map(|byte| i32::from(*byte)).sum::<i32>();
-                            bytes.map(i8::cast_unsigned)
-                        } else {
-                            {
-                            let [low, high] = [0, 1].map(|at| bfloat(value(at)).to_le_bytes());
-                            [low[0], low[1], high[0], high[1]]
-                        }
+                        let value = |at: usize| {
+                            if group + at < run {
+                                weight(first + group + at, output)
+                            } else {
+                                0.0
+                            }
+                        };
+                        groups.0[lane] = match precision {
+                            Precision::Int8 => {
+                                let bytes = [0, 1, 2, 3].map(|at| (value(at) / factors[vector].0[lane]).round() as i8);
+                                sums.0[lane] += bytes.map(i32::from).iter().sum::<i32>();
+                                bytes.map(i8::cast_unsigned)
+                            }
+                            Precision::F32 | Precision::Bf16 => halves([value(0), value(1)]),
                         };
                     }
                     packed.push(groups);
@@ -200,7 +203,7 @@ impl OutputPanel {
             vectors: to - from,
             weights: packed,
             factors,
-            weight_sums: sums,
+            weight_sums,
             bias: of_outputs(&|output| bias.get(output).copied().unwrap_or(0.0)),
         }
     }
@@ -212,7 +215,9 @@ impl ByteRange {
         #[cfg(target_arch = "x86_64")]
         let (least, most) = x86::extremes(values);
         #[cfg(not(target_arch = "x86_64"))]
-        let (least, most) = values.iter().fold((0.0f32, 0.0f32), |(least, most), &value| (least.min(value), most.max(value)));
+        let (least, most) = values.iter().fold((0.0f32, 0.0f32), |(least, most), &value| {
+            (least.min(value), most.max(value))
+        });
         let scale = (most - least) / MOST_OF_INPUT;
         if scale.is_normal() {
             let zero = (-least / scale).round() as u8;
@@ -247,7 +252,7 @@ impl ByteRange {
         const ROUND: f32 = 8_388_608.0;
         let (factor, first) = (self.scale.recip(), ROUND + f32::from(self.zero));
         for (to, value) in to.iter_mut().zip(values) {
-            let shifted = (value * factor + first).max(ROUND).min(ROUND + MOST_OF_INPUT);
+            let shifted = (value * factor + first).clamp(ROUND, ROUND + MOST_OF_INPUT);
             *to = shifted.to_bits() as u8;
         }
     }
@@ -283,6 +288,12 @@ fn write_bfloats(values: &[f32], to: &mut [[u8; 2]]) {
     }
 }
 
+/// A group of bfloat16.
+fn halves(values: [f32; 2]) -> Group {
+    let [[a, b], [c, d]] = values.map(|value| bfloat(value).to_le_bytes());
+    [a, b, c, d]
+}
+
 /// A value as bfloat16, rounded to the nearest, ties to even.
 #[inline(always)]
 fn bfloat(value: f32) -> u16 {
@@ -311,8 +322,19 @@ mod tests {
                 eprintln!("skipped: this processor does not multiply {precision}");
                 continue;
             }
-            for (rows, inputs, outputs) in [(1, 3, 1), (13, 20, 12), (8, 7, 16), (30, 33, 48), (5, 9, 50), (3, 4, 129)] {
-                let (x, weights, bias) = (values(rows * inputs, 1), values(inputs * outputs, 2), values(outputs, 3));
+            for (rows, inputs, outputs) in [
+                (1, 3, 1),
+                (13, 20, 12),
+                (8, 7, 16),
+                (30, 33, 48),
+                (5, 9, 50),
+                (3, 4, 129),
+            ] {
+                let (x, weights, bias) = (
+                    values(rows * inputs, 1),
+                    values(inputs * outputs, 2),
+                    values(outputs, 3),
+                );
                 let mut out = vec![7.0; rows * outputs];
                 ReducedWeights::new(&weights, &bias, inputs, precision).multiply_rows(&x, &mut out);
                 for (index, found) in out.iter().enumerate() {
@@ -321,7 +343,9 @@ mod tests {
                     let column: Vec<f32> = (0..inputs).map(|input| weights[input * outputs + output]).collect();
                     let (row, column) = match precision {
                         Precision::Int8 => (of_bytes(row), of_weight_bytes(&column)),
-                        _ => [row, &column].map(|values| values.iter().map(|value| half(*value)).collect()).into(),
+                        _ => [row, &column]
+                            .map(|values| values.iter().map(|value| half(*value)).collect())
+                            .into(),
                     };
                     let expected = bias[output] + row.iter().zip(&column).map(|(x, w)| x * w).sum::<f32>();
                     assert!((found - expected).abs() < 2e-5, "{precision}: {found} {expected}");
@@ -336,7 +360,9 @@ mod tests {
         let mut groups = vec![[0; 4]; row.len().div_ceil(4)];
         range.write(row, row.len(), &mut groups);
         let bytes = groups.as_flattened()[..row.len()].iter();
-        bytes.map(|byte| (f32::from(*byte) - f32::from(range.zero)) * range.scale).collect()
+        bytes
+            .map(|byte| (f32::from(*byte) - f32::from(range.zero)) * range.scale)
+            .collect()
     }
 
     fn of_weight_bytes(column: &[f32]) -> Vec<f32> {
@@ -346,7 +372,12 @@ mod tests {
 
     #[test]
     fn bytes_stand_for_nearly_the_same_values() {
-        for row in [&[0.0; 5][..], &[-1.0, 2.5, 0.3, 1e-3, 0.0, 2.4999], &[3.0, 7.0], &[-0.1; 7]] {
+        for row in [
+            &[0.0; 5][..],
+            &[-1.0, 2.5, 0.3, 1e-3, 0.0, 2.4999],
+            &[3.0, 7.0],
+            &[-0.1; 7],
+        ] {
             let scale = ByteRange::of(row).scale;
             for (found, value) in of_bytes(row).into_iter().zip(row) {
                 assert!((found - value).abs() <= 0.5001 * scale, "{row:?}: {found} {value}");
@@ -357,7 +388,13 @@ mod tests {
 
     #[test]
     fn halves_are_the_nearest() {
-        for (value, expected) in [(1.0, 1.0), (1.003, 1.0), (1.005, 1.0078125), (-3.3, -3.296875), (0.0, 0.0)] {
+        for (value, expected) in [
+            (1.0, 1.0),
+            (1.003, 1.0),
+            (1.005, 1.007_812_5),
+            (-3.3, -3.296_875),
+            (0.0, 0.0),
+        ] {
             assert_eq!(half(value), expected);
         }
     }

@@ -9,6 +9,9 @@ use super::reduced::ReducedWeights;
 use crate::nn::precision::Precision;
 use crate::nn::tensors::with_values;
 
+/// The sum of so many products of a byte and a signed one, 255 · 127 each at most, fits 32 bits.
+const MOST_INPUTS_OF_BYTES: usize = 1 << 16;
+
 /// Weights `[inputs, outputs]` and a bias.
 #[derive(Debug)]
 pub(in crate::nn) enum RowWeights {
@@ -17,15 +20,14 @@ pub(in crate::nn) enum RowWeights {
 }
 
 impl RowWeights {
-    /// Packs weights `[inputs, outputs]` and a bias `[outputs]`.
+    /// Packs weights `[inputs, outputs]` and a bias `[outputs]`. More inputs than [`MOST_INPUTS_OF_BYTES`] are not multiplied as bytes.
     pub(in crate::nn) fn new(weights: &[f32], bias: &[f32], precision: Precision) -> Self {
-        match precision {
-            Precision::F32 => Self::Single(PackedWeights::new(weights, bias)),
-            Precision::Bf16 | Precision::Int8 => {
-                let inputs = weights.len() / bias.len().max(1);
-                Self::Reduced(ReducedWeights::new(weights, bias, inputs, precision))
-            }
+        let inputs = weights.len() / bias.len().max(1);
+        let is_too_long = precision == Precision::Int8 && inputs > MOST_INPUTS_OF_BYTES;
+        if precision == Precision::F32 || is_too_long {
+            return Self::Single(PackedWeights::new(weights, bias));
         }
+        Self::Reduced(ReducedWeights::new(weights, bias, inputs, precision))
     }
 
     /// Packs the weights and the bias of a layer as they are now.

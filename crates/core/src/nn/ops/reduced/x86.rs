@@ -3,8 +3,9 @@
 #![allow(clippy::inline_always)]
 
 use std::arch::x86_64::{
-    __m512, __m512bh, __m512i, _mm512_add_ps, _mm512_cvtepi32_ps, _mm512_dpbf16_ps, _mm512_dpbusd_epi32, _mm512_max_ps, _mm512_min_ps, _mm512_mul_ps,
-    _mm512_mullo_epi32, _mm512_reduce_max_ps, _mm512_reduce_min_ps, _mm512_set1_epi32, _mm512_set1_ps, _mm512_setzero_ps, _mm512_setzero_si512, _mm512_sub_epi32,
+    __m512, __m512bh, __m512i, _mm512_add_ps, _mm512_cvtepi32_ps, _mm512_dpbf16_ps, _mm512_dpbusd_epi32, _mm512_max_ps,
+    _mm512_min_ps, _mm512_mul_ps, _mm512_mullo_epi32, _mm512_reduce_max_ps, _mm512_reduce_min_ps, _mm512_set1_epi32,
+    _mm512_set1_ps, _mm512_setzero_ps, _mm512_setzero_si512, _mm512_sub_epi32,
 };
 
 use super::{ByteRange, Group, LANES, Lanes, MAX_VECTORS, OutputPanel, PlaceGroups, Product};
@@ -12,10 +13,16 @@ use crate::nn::ops::packed::StartSums;
 use crate::nn::precision::Precision;
 
 /// Computes a product with the instructions of its precision.
-#[expect(unsafe_code, reason = "only the processor can tell whether it has the instructions, and it is asked first")]
+#[expect(
+    unsafe_code,
+    reason = "only the processor can tell whether it has the instructions, and it is asked first"
+)]
 pub(super) fn multiply(product: Product) {
     let precision = product.weights.precision;
-    assert!(precision.is_supported(), "weights in {precision} on this processor are a bug");
+    assert!(
+        precision.is_supported(),
+        "weights in {precision} on this processor are a bug"
+    );
     match precision {
         // SAFETY: `is_supported` found the features of this function.
         Precision::Int8 => unsafe { multiply_bytes(product) },
@@ -25,7 +32,10 @@ pub(super) fn multiply(product: Product) {
 }
 
 /// The least and the largest of the values and of 0.
-#[expect(unsafe_code, reason = "only the processor can tell whether it has the instructions, and it is asked first")]
+#[expect(
+    unsafe_code,
+    reason = "only the processor can tell whether it has the instructions, and it is asked first"
+)]
 pub(super) fn extremes(values: &[f32]) -> (f32, f32) {
     assert!(Precision::Int8.is_supported(), "bytes on this processor are a bug");
     // SAFETY: `is_supported` found the features of this function.
@@ -54,8 +64,12 @@ fn extremes_of_vectors(values: &[f32]) -> (f32, f32) {
         least[0] = _mm512_min_ps(values, least[0]);
         most[0] = _mm512_max_ps(values, most[0]);
     }
-    let least = least.into_iter().fold(_mm512_setzero_ps(), |least, vector| _mm512_min_ps(vector, least));
-    let most = most.into_iter().fold(_mm512_setzero_ps(), |most, vector| _mm512_max_ps(vector, most));
+    let least = least
+        .into_iter()
+        .fold(_mm512_setzero_ps(), |least, vector| _mm512_min_ps(vector, least));
+    let most = most
+        .into_iter()
+        .fold(_mm512_setzero_ps(), |most, vector| _mm512_max_ps(vector, most));
     (_mm512_reduce_min_ps(least), _mm512_reduce_max_ps(most))
 }
 
@@ -111,7 +125,9 @@ macro_rules! products {
                 panel: &OutputPanel,
                 place: usize,
             ) {
-                let PlaceGroups { groups, step, runs, .. } = product.inputs;
+                let PlaceGroups {
+                    groups, step, runs, ..
+                } = product.inputs;
                 let weights = panel.weights.as_chunks::<VECTORS>().0;
                 let mut sums = [[$no_sum; VECTORS]; PLACES];
                 for run in runs {
