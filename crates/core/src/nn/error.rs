@@ -90,8 +90,8 @@ pub enum NnError {
     /// Predictions cannot be in this precision.
     #[error("precision is \"{precision}\": {reason}")]
     Precision {
-        /// The precision.
-        precision: super::precision::Precision,
+        /// The precision's name.
+        precision: String,
         /// Why not, and what can be done.
         reason: String,
     },

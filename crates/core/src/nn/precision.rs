@@ -99,7 +99,10 @@ impl From<Precision> for String {
 /// Makes all models that are loaded from now on predict with it. Errors: `Precision` if this processor cannot, or another precision was
 /// chosen before.
 pub fn choose(precision: Precision) -> Result<(), NnError> {
-    let refused = |reason| NnError::Precision { precision, reason };
+    let refused = |reason| NnError::Precision {
+        precision: precision.to_string(),
+        reason,
+    };
     if !precision.is_supported() {
         let instructions = precision.instructions();
         return Err(refused(format!(

@@ -29,7 +29,7 @@ pub(super) type Group = [u8; 4];
 /// A vector of 512 bits.
 #[derive(Clone, Copy, Debug)]
 #[repr(C, align(64))]
-struct Lanes<T>([T; LANES]);
+struct Register<T>([T; LANES]);
 
 /// Weights and a bias.
 #[derive(Debug)]
@@ -47,11 +47,11 @@ struct OutputPanel {
     /// Vectors of a group's weights.
     vectors: usize,
     /// `[groups, vectors]`.
-    weights: Vec<Lanes<Group>>,
+    weights: Vec<Register<Group>>,
     /// `[vectors]` each: of whole numbers, the factors and the sums of the weights.
-    factors: Vec<Lanes<f32>>,
-    weight_sums: Vec<Lanes<i32>>,
-    bias: Vec<Lanes<f32>>,
+    factors: Vec<Register<f32>>,
+    weight_sums: Vec<Register<i32>>,
+    bias: Vec<Register<f32>>,
 }
 
 /// The groups of neighbouring places.
@@ -159,10 +159,10 @@ impl OutputPanel {
         };
         let inputs = weights.len() / outputs;
         let lanes = |vector: usize| (from + vector) * LANES..(from + vector + 1) * LANES;
-        let of_outputs = |value: &dyn Fn(usize) -> f32| -> Vec<Lanes<f32>> {
+        let of_outputs = |value: &dyn Fn(usize) -> f32| -> Vec<Register<f32>> {
             let vector = |vector| {
                 let first = lanes(vector).start;
-                Lanes(std::array::from_fn(|lane| value(first + lane)))
+                Register(std::array::from_fn(|lane| value(first + lane)))
             };
             (0..to - from).map(vector).collect()
         };
@@ -170,12 +170,12 @@ impl OutputPanel {
             let largest = (0..inputs).fold(0.0f32, |most, input| most.max(weight(input, output).abs()));
             if largest > 0.0 { largest / MOST_OF_WEIGHT } else { 1.0 }
         });
-        let mut weight_sums = vec![Lanes([0; LANES]); to - from];
+        let mut weight_sums = vec![Register([0; LANES]); to - from];
         let mut packed = Vec::new();
         for first in (0..inputs).step_by(run.max(1)) {
             for group in (0..run).step_by(inputs_of_group(precision)) {
                 for (vector, sums) in weight_sums.iter_mut().enumerate() {
-                    let mut groups = Lanes([[0; 4]; LANES]);
+                    let mut groups = Register([[0; 4]; LANES]);
                     for (lane, output) in lanes(vector).enumerate() {
                         // A run's end has no weights of the next one.
                         let value = |at: usize| {

@@ -3,8 +3,6 @@
 
 use std::cell::Cell;
 
-use super::reduced::Group;
-
 /// Buffers that an operation can have at once.
 const BUFFERS: usize = 3;
 /// Values in a line of the cache. Each buffer begins with a line: a vector that lies in two of them takes longer to read and to write.
@@ -33,14 +31,14 @@ pub(super) fn with_buffers<R>(lengths: [usize; BUFFERS], run: impl FnOnce([&mut 
 }
 
 thread_local! {
-    static KEPT_GROUPS: Cell<Vec<Group>> = const { Cell::new(Vec::new()) };
+    static KEPT_GROUPS: Cell<Vec<[u8; 4]>> = const { Cell::new(Vec::new()) };
 }
 
-/// Calls `run` with a buffer of so many groups, whose contents are unspecified.
-pub(super) fn with_groups<R>(length: usize, run: impl FnOnce(&mut [Group]) -> R) -> R {
+/// Calls `run` with a buffer of so many groups of bytes, whose contents are unspecified.
+pub(super) fn with_groups<R>(length: usize, run: impl FnOnce(&mut [[u8; 4]]) -> R) -> R {
     let mut kept = KEPT_GROUPS.take();
     if kept.len() < length {
-        kept.resize(length, Group::default());
+        kept.resize(length, [0; 4]);
     }
     let result = run(&mut kept[..length]);
     KEPT_GROUPS.set(kept);

@@ -8,7 +8,7 @@ use std::arch::x86_64::{
     _mm512_set1_ps, _mm512_setzero_ps, _mm512_setzero_si512, _mm512_sub_epi32,
 };
 
-use super::{ByteRange, Group, LANES, Lanes, MAX_VECTORS, OutputPanel, PlaceGroups, Product};
+use super::{ByteRange, Group, LANES, MAX_VECTORS, OutputPanel, PlaceGroups, Product, Register};
 use crate::nn::ops::packed::StartSums;
 use crate::nn::precision::Precision;
 
@@ -52,15 +52,15 @@ fn extremes_of_vectors(values: &[f32]) -> (f32, f32) {
     let mut most = least;
     for vectors in together {
         for at in 0..TOGETHER {
-            let values = float_bits(Lanes(vectors[at]));
+            let values = float_bits(Register(vectors[at]));
             least[at] = _mm512_min_ps(values, least[at]);
             most[at] = _mm512_max_ps(values, most[at]);
         }
     }
-    let mut last = Lanes([0.0; LANES]);
+    let mut last = Register([0.0; LANES]);
     last.0[..rest.len()].copy_from_slice(rest);
     for vector in others.iter().chain([&last.0]) {
-        let values = float_bits(Lanes(*vector));
+        let values = float_bits(Register(*vector));
         least[0] = _mm512_min_ps(values, least[0]);
         most[0] = _mm512_max_ps(values, most[0]);
     }
@@ -88,11 +88,11 @@ macro_rules! casts {
 }
 
 casts! {
-    group_bits: Lanes<Group> => __m512i;
-    whole_bits: Lanes<i32> => __m512i;
-    float_bits: Lanes<f32> => __m512;
+    group_bits: Register<Group> => __m512i;
+    whole_bits: Register<i32> => __m512i;
+    float_bits: Register<f32> => __m512;
     halves: __m512i => __m512bh;
-    floats: __m512 => Lanes<f32>;
+    floats: __m512 => Register<f32>;
 }
 
 /// A function that computes a product, and its parts: the same loops for two kinds of instructions. The sums of up to 8 places and 3
@@ -211,7 +211,7 @@ impl PlaceGroups<'_> {
 impl Product<'_> {
     /// Writes the sums of a vector of outputs at a place.
     #[inline(always)]
-    fn store(&mut self, panel: &OutputPanel, [place, vector]: [usize; 2], Lanes(sums): Lanes<f32>) {
+    fn store(&mut self, panel: &OutputPanel, [place, vector]: [usize; 2], Register(sums): Register<f32>) {
         let outputs = self.weights.outputs;
         let first = panel.first + vector * LANES;
         let out = &mut self.out[place * outputs + first..][..LANES.min(outputs - first)];
