@@ -44,8 +44,9 @@ impl Precision {
         }
     }
 
-    /// That of layers with few inputs, where it takes as long to find the scale of whole numbers as to multiply them.
-    pub(super) fn of_few_inputs(self) -> Self {
+    /// That of layers for which 8 bits are too few, or that have so few inputs that it takes as long to find their scale as to multiply
+    /// them. A processor without bf16 takes single precision.
+    pub(super) fn at_least_bf16(self) -> Self {
         match self {
             Self::Int8 if Self::Bf16.is_supported() => Self::Bf16,
             Self::Int8 => Self::F32,

@@ -68,13 +68,10 @@ impl DenseNetwork {
         if precision == Precision::F32 || self.layers == LayerForm::Plain {
             return Ok(());
         }
-        for layer in [
-            &mut self.frame_encoder,
-            &mut self.frame_decoder,
-            &mut self.predictor_output,
-        ] {
-            layer.pack(precision)?;
-        }
+        // It tells small differences of still pictures apart; with 8 bits, `static` loses 0.03 of its skill.
+        self.frame_encoder.pack(precision.at_least_bf16())?;
+        self.frame_decoder.pack(precision)?;
+        self.predictor_output.pack(precision)?;
         self.encoder.pack(0, precision)?;
         self.predictor.pack(self.sizes.features, precision)
     }

@@ -48,7 +48,7 @@ impl DepthHead {
 
     /// Packs the layers' weights for prediction.
     pub(super) fn pack(&mut self, precision: Precision) -> Result<(), NnError> {
-        self.enlarge.pack(precision.of_few_inputs())?;
+        self.enlarge.pack(precision.at_least_bf16())?;
         Ok(self.output.pack(precision)?)
     }
 

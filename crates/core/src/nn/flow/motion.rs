@@ -55,7 +55,7 @@ impl MotionHead {
     /// Packs the layers' weights for prediction.
     pub(super) fn pack(&mut self, precision: Precision) -> Result<(), NnError> {
         for layer in self.layers.iter_mut().flatten().chain(&mut self.affine) {
-            layer.pack(precision.of_few_inputs())?;
+            layer.pack(precision.at_least_bf16())?;
         }
         Ok(())
     }

@@ -26,8 +26,8 @@ impl MoverHead {
 
     /// Packs the layers' weights for prediction.
     pub(super) fn pack(&mut self, precision: Precision) -> Result<(), NnError> {
-        self.seen.pack(precision.of_few_inputs())?;
-        Ok(self.coming.pack(precision.of_few_inputs())?)
+        self.seen.pack(precision.at_least_bf16())?;
+        Ok(self.coming.pack(precision.at_least_bf16())?)
     }
 
     /// Where they are in the last frames `[contexts, P]`, from the encoder's features.

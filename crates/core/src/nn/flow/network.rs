@@ -127,7 +127,7 @@ impl FlowNetwork {
             convolution.pack(precision)?;
         }
         for linear in self.modulation.iter_mut().chain([&mut self.mix, &mut self.enlarge]) {
-            linear.pack(precision.of_few_inputs())?;
+            linear.pack(precision.at_least_bf16())?;
         }
         self.motion.pack(precision)?;
         if let Some(movers) = &mut self.movers {

@@ -112,7 +112,7 @@ impl Scene {
     /// Packs the layers' weights for prediction.
     pub(super) fn pack(&mut self, precision: Precision) -> Result<(), NnError> {
         for layer in &mut self.layers {
-            layer.pack(precision.of_few_inputs())?;
+            layer.pack(precision.at_least_bf16())?;
         }
         Ok(())
     }

@@ -59,7 +59,7 @@ impl SpeedHead {
         for convolution in self.blocks.iter_mut().chain([&mut self.halving]) {
             convolution.pack(precision)?;
         }
-        Ok(self.votes.pack(precision.of_few_inputs())?)
+        Ok(self.votes.pack(precision.at_least_bf16())?)
     }
 
     /// Forward speed in m/s and yaw rate in rad/s at the last frame of each context `[contexts, 2]`.

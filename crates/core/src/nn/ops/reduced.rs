@@ -36,12 +36,12 @@ struct Register<T>([T; LANES]);
 pub(in crate::nn) struct ReducedWeights {
     outputs: usize,
     precision: Precision,
-    panels: Vec<OutputPanel>,
+    panels: Vec<ReducedPanel>,
 }
 
 /// The weights of neighbouring outputs, filled up with zeros to whole vectors.
 #[derive(Debug)]
-struct OutputPanel {
+struct ReducedPanel {
     /// The first of them.
     first: usize,
     /// Vectors of a group's weights.
@@ -74,7 +74,7 @@ pub(super) struct ByteRange {
 }
 
 /// What one call computes.
-struct Product<'a> {
+struct ReducedProduct<'a> {
     weights: &'a ReducedWeights,
     inputs: PlaceGroups<'a>,
     out: &'a mut [f32],
@@ -90,7 +90,7 @@ impl ReducedWeights {
         let panel = |index: usize| {
             // As equal as possible.
             let [from, to] = [index, index + 1].map(|index| index * vectors / panels);
-            OutputPanel::new(weights, bias, [from, to], run, precision)
+            ReducedPanel::new(weights, bias, [from, to], run, precision)
         };
         Self {
             outputs,
@@ -105,7 +105,7 @@ impl ReducedWeights {
 
     /// Writes the sums of each place to `out` `[places, outputs]`. A processor without the instructions is a bug.
     pub(super) fn multiply(&self, inputs: PlaceGroups, out: &mut [f32], start: StartSums) {
-        let product = Product {
+        let product = ReducedProduct {
             weights: self,
             inputs,
             out,
@@ -150,7 +150,7 @@ impl ReducedWeights {
     }
 }
 
-impl OutputPanel {
+impl ReducedPanel {
     fn new(weights: &[f32], bias: &[f32], [from, to]: [usize; 2], run: usize, precision: Precision) -> Self {
         let outputs = bias.len();
         let weight = |input: usize, output: usize| {

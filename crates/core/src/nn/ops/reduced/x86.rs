@@ -8,7 +8,7 @@ use std::arch::x86_64::{
     _mm512_set1_ps, _mm512_setzero_ps, _mm512_setzero_si512, _mm512_sub_epi32,
 };
 
-use super::{ByteRange, Group, LANES, MAX_VECTORS, OutputPanel, PlaceGroups, Product, Register};
+use super::{ByteRange, Group, LANES, MAX_VECTORS, PlaceGroups, ReducedPanel, ReducedProduct, Register};
 use crate::nn::ops::packed::StartSums;
 use crate::nn::precision::Precision;
 
@@ -17,7 +17,7 @@ use crate::nn::precision::Precision;
     unsafe_code,
     reason = "only the processor can tell whether it has the instructions, and it is asked first"
 )]
-pub(super) fn multiply(product: Product) {
+pub(super) fn multiply(product: ReducedProduct) {
     let precision = product.weights.precision;
     assert!(
         precision.is_supported(),
@@ -100,9 +100,9 @@ casts! {
 macro_rules! products {
     ($name:ident, $features:literal, $no_sum:expr, $product:expr, $finished:expr) => {
         #[target_feature(enable = $features)]
-        fn $name(mut product: Product) {
+        fn $name(mut product: ReducedProduct) {
             #[target_feature(enable = $features)]
-            fn panel<const VECTORS: usize>(product: &mut Product, panel: &OutputPanel) {
+            fn panel<const VECTORS: usize>(product: &mut ReducedProduct, panel: &ReducedPanel) {
                 let (mut place, places) = (0, product.out.len() / product.weights.outputs);
                 while place + 8 <= places {
                     block::<8, VECTORS>(product, panel, place);
@@ -121,8 +121,8 @@ macro_rules! products {
             #[target_feature(enable = $features)]
             #[inline]
             fn block<const PLACES: usize, const VECTORS: usize>(
-                product: &mut Product,
-                panel: &OutputPanel,
+                product: &mut ReducedProduct,
+                panel: &ReducedPanel,
                 place: usize,
             ) {
                 let PlaceGroups {
@@ -171,7 +171,7 @@ products!(
     "avx512f,avx512bf16",
     _mm512_setzero_ps(),
     add_halves,
-    |sum: __m512, _: Option<ByteRange>, _: &OutputPanel, _: usize| sum
+    |sum: __m512, _: Option<ByteRange>, _: &ReducedPanel, _: usize| sum
 );
 products!(
     multiply_bytes,
@@ -190,7 +190,7 @@ fn add_halves(sum: __m512, group: __m512i, weights: __m512i) -> __m512 {
 /// What sums of products of bytes stand for.
 #[target_feature(enable = "avx512f")]
 #[inline]
-fn finish_bytes(sum: __m512i, range: Option<ByteRange>, panel: &OutputPanel, vector: usize) -> __m512 {
+fn finish_bytes(sum: __m512i, range: Option<ByteRange>, panel: &ReducedPanel, vector: usize) -> __m512 {
     let ByteRange { scale, zero } = range.unwrap_or_default();
     let of_zeros = _mm512_mullo_epi32(_mm512_set1_epi32(zero.into()), whole_bits(panel.weight_sums[vector]));
     let factor = _mm512_mul_ps(_mm512_set1_ps(scale), float_bits(panel.factors[vector]));
@@ -208,10 +208,10 @@ impl PlaceGroups<'_> {
     }
 }
 
-impl Product<'_> {
+impl ReducedProduct<'_> {
     /// Writes the sums of a vector of outputs at a place.
     #[inline(always)]
-    fn store(&mut self, panel: &OutputPanel, [place, vector]: [usize; 2], Register(sums): Register<f32>) {
+    fn store(&mut self, panel: &ReducedPanel, [place, vector]: [usize; 2], Register(sums): Register<f32>) {
         let outputs = self.weights.outputs;
         let first = panel.first + vector * LANES;
         let out = &mut self.out[place * outputs + first..][..LANES.min(outputs - first)];
