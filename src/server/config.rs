@@ -78,8 +78,8 @@ settings! {
     /// the Cargo feature `cuda`.
     #[schema(value_type = String)]
     device: DeviceName = DeviceName::Cpu;
-    /// In which numbers the processor predicts: `f32`, or for faster and slightly less exact predictions `bf16` or `int8`, which need
-    /// a processor with AVX-512 BF16 or AVX-512 VNNI.
+    /// In which numbers the processor predicts: `f32`, or for faster and slightly less exact predictions `bf16` (needs a processor
+    /// with AVX-512 BF16) or `int8` (AVX-512 VNNI).
     #[schema(value_type = String)]
     precision: Precision = Precision::F32;
     /// `sqlite:FILE` or `postgres://…`. Default: a file in the data directory.

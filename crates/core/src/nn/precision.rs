@@ -12,7 +12,8 @@ use super::error::NnError;
 /// The chosen precision.
 static CHOSEN: OnceLock<Precision> = OnceLock::new();
 
-/// In which numbers predictions multiply inputs with weights. Sums, and all else, are in single precision.
+/// In which numbers predictions multiply inputs with weights. A few layers take more bits. Sums of bytes are exact whole numbers; all else
+/// is in single precision.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub enum Precision {
@@ -51,6 +52,24 @@ impl Precision {
             Self::Int8 if Self::Bf16.is_supported() => Self::Bf16,
             Self::Int8 => Self::F32,
             Self::F32 | Self::Bf16 => self,
+        }
+    }
+
+    /// Errors: `Precision` if this processor does not multiply such numbers.
+    pub(super) fn check_support(self) -> Result<(), NnError> {
+        if self.is_supported() {
+            return Ok(());
+        }
+        let instructions = self.instructions();
+        Err(self.refused(format!(
+            "this processor has no {instructions}; use \"f32\", which every processor has"
+        )))
+    }
+
+    fn refused(self, reason: String) -> NnError {
+        NnError::Precision {
+            precision: self.to_string(),
+            reason,
         }
     }
 
@@ -100,19 +119,10 @@ impl From<Precision> for String {
 /// Makes all models that are loaded from now on predict with it. Errors: `Precision` if this processor cannot, or another precision was
 /// chosen before.
 pub fn choose(precision: Precision) -> Result<(), NnError> {
-    let refused = |reason| NnError::Precision {
-        precision: precision.to_string(),
-        reason,
-    };
-    if !precision.is_supported() {
-        let instructions = precision.instructions();
-        return Err(refused(format!(
-            "this processor has no {instructions}; use \"f32\", which every processor has"
-        )));
-    }
+    precision.check_support()?;
     let chosen = *CHOSEN.get_or_init(|| precision);
     if chosen != precision {
-        return Err(refused(format!("this process already predicts in \"{chosen}\"")));
+        return Err(precision.refused(format!("this process already predicts in \"{chosen}\"")));
     }
     Ok(())
 }

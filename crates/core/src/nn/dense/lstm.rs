@@ -24,7 +24,7 @@ pub fn unroll(cell: &PeepholeCell, x: &Tensor, state: &LstmState) -> Result<(Ten
 /// steps, `[T · B, 4H]`.
 fn input_projection(cell: &PeepholeCell, x: &Tensor, first_row: usize) -> Result<Tensor, NnError> {
     let rows = x.transpose(0, 1)?.contiguous()?.flatten(0, 1)?;
-    // In a decoder with teacher forcing, all inputs are known.
+    // With teacher forcing, a decoder knows all inputs; the packed rows are those of the conditions only.
     if let Some(packed) = cell
         .packed
         .as_ref()
@@ -32,7 +32,11 @@ fn input_projection(cell: &PeepholeCell, x: &Tensor, first_row: usize) -> Result
     {
         let count = rows.dim(0)?;
         let sums = with_values(&rows, |rows| packed.projection.times(rows, count))?;
-        return Ok(Tensor::from_vec(sums, (count, ()), x.device())?);
+        return Ok(Tensor::from_vec(
+            sums,
+            (count, packed.projection.outputs()),
+            x.device(),
+        )?);
     }
     let layer = Linear {
         weight: cell.w_x.narrow(0, first_row, x.dim(2)?)?,

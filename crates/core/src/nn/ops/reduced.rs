@@ -2,7 +2,8 @@
 //! give: two of bfloat16, or four whole numbers. Such neighbours are a group, of 32 bits.
 //!
 //! Whole numbers: x = scale · (byte − zero), with one scale and zero for a row or an image, so that 0 is exact; w = factor · byte, with
-//! one factor for each output. A sum of products of bytes is exact. It becomes scale · factor · (Σ x w − zero · Σ w).
+//! one factor for each output. A sum of products of bytes is exact. It becomes
+//! scale · factor · (Σ byte of x · byte of w − zero · Σ byte of w).
 // A closure's vector instructions reach what is inlined into it, and only that.
 #![allow(clippy::inline_always)]
 
@@ -119,7 +120,10 @@ impl ReducedWeights {
 
     /// The sums of rows `[rows, inputs]` without neighbours.
     pub(super) fn multiply_rows(&self, rows: &[f32], out: &mut [f32]) {
-        let count = (out.len() / self.outputs).max(1);
+        let count = out.len() / self.outputs;
+        if count == 0 {
+            return;
+        }
         let inputs = rows.len() / count;
         let length = inputs.div_ceil(inputs_of_group(self.precision));
         let runs = [TapRun {
@@ -212,12 +216,7 @@ impl ReducedPanel {
 impl ByteRange {
     /// That of these values and of 0.
     pub(super) fn of(values: &[f32]) -> Self {
-        #[cfg(target_arch = "x86_64")]
-        let (least, most) = x86::extremes(values);
-        #[cfg(not(target_arch = "x86_64"))]
-        let (least, most) = values.iter().fold((0.0f32, 0.0f32), |(least, most), &value| {
-            (least.min(value), most.max(value))
-        });
+        let (least, most) = extremes(values);
         let scale = (most - least) / MOST_OF_INPUT;
         if scale.is_normal() {
             let zero = (-least / scale).round() as u8;
@@ -256,6 +255,16 @@ impl ByteRange {
             *to = shifted.to_bits() as u8;
         }
     }
+}
+
+/// The least and the largest of the values and of 0.
+fn extremes(values: &[f32]) -> (f32, f32) {
+    #[cfg(target_arch = "x86_64")]
+    if Precision::Int8.is_supported() {
+        return x86::extremes(values);
+    }
+    let widened = |(least, most): (f32, f32), &value: &f32| (least.min(value), most.max(value));
+    values.iter().fold((0.0, 0.0), widened)
 }
 
 /// Inputs of a group.

@@ -20,7 +20,7 @@ pub(in crate::nn::dense) struct FeedbackLoop {
     pub(in crate::nn::dense) weight: Tensor,
     /// The same, packed.
     pub(in crate::nn::dense) packed: Option<Arc<RowWeights>>,
-    /// Bias of the features `[F]`.
+    /// Bias of the features `[F]`; zeros if `packed` adds it.
     pub(in crate::nn::dense) bias: Vec<f32>,
     /// Whether the layer's output is added to the previous features, instead of replacing them.
     pub(in crate::nn::dense) residual: bool,

@@ -27,7 +27,8 @@ pub(super) fn multiply(product: ReducedProduct) {
         // SAFETY: `is_supported` found the features of this function.
         Precision::Int8 => unsafe { multiply_bytes(product) },
         // SAFETY: the same.
-        Precision::F32 | Precision::Bf16 => unsafe { multiply_halves(product) },
+        Precision::Bf16 => unsafe { multiply_halves(product) },
+        Precision::F32 => unreachable!("reduced weights in single precision are a bug"),
     }
 }
 
