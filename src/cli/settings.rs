@@ -149,7 +149,8 @@ fn start(loaded: LoadedConfig) -> Result<Config, CliError> {
     Ok(loaded.config)
 }
 
-/// The configuration of a command that is about to work in its directories, on its device, in its precision. Errors: `Usage` if one cannot be used.
+/// The configuration of a command that is about to work in its directories, on its device and in its precision. Errors: `Usage` if one
+/// of them cannot be used.
 pub(super) fn with_checked_directories(loaded: LoadedConfig) -> Result<Config, CliError> {
     loaded.check_directories()?;
     loaded.choose_computation()?;

@@ -12,8 +12,8 @@
 //! the same networks are written in candle's own tensor operations: short to read, and the path of graphics cards ([`device`]).
 //! `plain_agreement` tests that both give the same predictions and gradients.
 //!
-//! The modules in reading order; each uses only those above it: `options` (enumerations) → [`error`] → [`device`], [`precision`] → [`tensors`] → `fused`
-//! (what an operation with a gradient of its own is) → `ops` (such operations) → `plain` → [`loss`], [`ssim_loss`], [`mask_loss`] →
+//! The modules in reading order; each uses only those above it: `options` (enumerations) → [`error`] → [`device`], [`precision`] →
+//! [`tensors`] → `fused` (what an operation with a gradient of its own is) → `ops` (such operations) → `plain` → [`loss`], [`ssim_loss`], [`mask_loss`] →
 //! [`spec`] (sizes and meaning of a model) → `model_tensors`, `conditioning` (actions and state) → `geometry` (cameras and wheels) → [`dense`], [`flow`] → `model_size` (tensors and cost) → `init`, [`parameters`] →
 //! [`network`]. [`costs`] compares the model's cost with other networks.
 

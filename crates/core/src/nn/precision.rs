@@ -12,8 +12,8 @@ use super::error::NnError;
 /// The chosen precision.
 static CHOSEN: OnceLock<Precision> = OnceLock::new();
 
-/// In which numbers predictions multiply inputs with weights. A few layers take more bits. Sums of bytes are exact whole numbers; all else
-/// is in single precision.
+/// The numbers in which predictions multiply inputs with weights. A few layers take more bits. Sums of bytes
+/// are exact whole numbers; all else is in single precision.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub enum Precision {
@@ -45,8 +45,8 @@ impl Precision {
         }
     }
 
-    /// That of layers for which 8 bits are too few, or that have so few inputs that it takes as long to find their scale as to multiply
-    /// them. A processor without bf16 takes single precision.
+    /// The precision of layers for which 8 bits are too few, and of layers with few inputs, where finding the scale of bytes takes as long
+    /// as the products. A processor without bf16 takes single precision there.
     pub(super) fn at_least_bf16(self) -> Self {
         match self {
             Self::Int8 if Self::Bf16.is_supported() => Self::Bf16,

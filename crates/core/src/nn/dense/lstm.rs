@@ -24,7 +24,7 @@ pub fn unroll(cell: &PeepholeCell, x: &Tensor, state: &LstmState) -> Result<(Ten
 /// steps, `[T · B, 4H]`.
 fn input_projection(cell: &PeepholeCell, x: &Tensor, first_row: usize) -> Result<Tensor, NnError> {
     let rows = x.transpose(0, 1)?.contiguous()?.flatten(0, 1)?;
-    // With teacher forcing, a decoder knows all inputs; the packed rows are those of the conditions only.
+    // The packed rows of a decoder are those of its conditions; with teacher forcing, it needs those of all inputs.
     if let Some(packed) = cell
         .packed
         .as_ref()
