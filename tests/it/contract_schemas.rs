@@ -97,6 +97,7 @@ fn every_job_body_fits_exactly_one_variant_of_its_schema() {
             "camera_height": 0.2, "skip_bad": true}),
         json!({"kind": "train", "name": "a", "preset": "paper", "dataset": "d", "settings": {"sequence": {"steps": 1}},
             "after": "job-1"}),
+        json!({"kind": "train", "name": "a", "from": "rooms", "from_version": 1, "dataset": "d"}),
         json!({"kind": "adapt", "name": "a", "dataset": "d", "from": "rooms", "from_version": 1, "steps": 9, "mirror": ["angle"], "remember": true}),
         json!({"kind": "evaluate", "model": "a", "dataset": "d", "version": 1, "windows": 10}),
     ];
@@ -111,6 +112,7 @@ fn every_job_body_fits_exactly_one_variant_of_its_schema() {
         json!({"kind": "collect", "name": "a", "scenario": "crowded", "trials": 2, "colour": "red"}),
         json!({"kind": "collect", "name": "a", "scenario": "crowded", "trials": 0}),
         json!({"kind": "import", "name": "a"}),
+        json!({"kind": "train", "name": "a", "preset": "papr", "dataset": "d"}),
         json!({"kind": "adapt", "name": "a", "dataset": "d", "steps": 0}),
         json!({"kind": "import", "name": "a", "source": "b", "every": 0}),
         json!({"kind": "import", "name": "a", "source": "b", "size": "small"}),

@@ -11,9 +11,10 @@ use serde_json::{Value, json};
 
 use crate::service::{Answer, app, context, get, poll_until, post, send, store, with_data};
 
-const JOBS: &str = "/v1/jobs";
+pub(crate) const JOBS: &str = "/v1/jobs";
 
-fn train(name: &str, steps: usize) -> Value {
+/// A short training on `seen`.
+pub(crate) fn train(name: &str, steps: usize) -> Value {
     let settings = json!({
         "model": {"features": 8, "hidden": 8},
         "data": {"windows": 8, "validation_windows": 4},
@@ -25,7 +26,7 @@ fn train(name: &str, steps: usize) -> Value {
 }
 
 /// Creates a job and waits until it has succeeded.
-async fn run_job(app: &App, body: &Value) -> Value {
+pub(crate) async fn run_job(app: &App, body: &Value) -> Value {
     let taken = post(app, JOBS, body).await;
     assert_eq!(taken.status, 202, "{}", taken.json());
     let path = format!("{JOBS}/{}", taken.json()["id"].as_str().unwrap());
@@ -37,7 +38,8 @@ async fn run_job(app: &App, body: &Value) -> Value {
     .await
 }
 
-async fn collect_data_set(app: &App) -> Value {
+/// Collects `seen`.
+pub(crate) async fn collect_data_set(app: &App) -> Value {
     let seen = json!({"kind": "collect", "name": "seen", "scenario": "static-observer", "trials": 40});
     run_job(app, &seen).await
 }
@@ -90,7 +92,8 @@ async fn delete(app: &App, path: &str) -> Answer {
     send(app, Request::delete(path).body(Body::empty()).unwrap()).await
 }
 
-async fn wait_for_version(app: &App, model: &str, version: u32) -> Value {
+/// Waits until this version is active.
+pub(crate) async fn wait_for_version(app: &App, model: &str, version: u32) -> Value {
     poll_until(async || {
         let answer = get(app, &format!("/v1/models/{model}")).await;
         let description = (answer.status == 200).then(|| answer.json())?;

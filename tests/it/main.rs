@@ -48,6 +48,7 @@ mod inspection;
 mod jobs;
 mod jobs_checkpoints;
 mod jobs_end_to_end;
+mod jobs_from_model;
 mod jobs_import;
 mod jobs_killed;
 mod jobs_limits;

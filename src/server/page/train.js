@@ -25,7 +25,7 @@ function Trainings({ models, datasets, jobs, parameters }) {
   if (!datasets) return html`<p class="quiet wait">Loading…</p>`;
   const chosen = parameters.job ?? jobs.find(isTraining)?.id;
   return html`
-    ${datasets.length ? html`<div class="forms"><${NewTraining} datasets=${datasets} jobs=${jobs} submit=${submit} />${models.some(canBeAdapted) && html`<${NewAdaptation} models=${models.filter(canBeAdapted)} datasets=${datasets} submit=${submit} />`}<${NewEvaluation} models=${models} datasets=${datasets} submit=${submit} /></div>`
+    ${datasets.length ? html`<div class="forms"><${NewTraining} models=${models} datasets=${datasets} jobs=${jobs} submit=${submit} />${models.some(canBeAdapted) && html`<${NewAdaptation} models=${models.filter(canBeAdapted)} datasets=${datasets} submit=${submit} />`}<${NewEvaluation} models=${models} datasets=${datasets} submit=${submit} /></div>`
       : html`<div class="empty"><h2>First a data set</h2><p><a href="#data">Collect or import one</a>; then train on it here.</p></div>`}
     <p class="wrong" role="alert">${wrong}</p>
     ${jobs.length > 0 && html`<h2>Jobs</h2><${Jobs} jobs=${jobs} chosen=${chosen} />`}
@@ -86,33 +86,36 @@ function useEstimate(spec) {
 const memory = mib => (mib < 1024 ? `${mib} MiB` : `${(mib / 1024).toFixed(1)} GiB`);
 const ESTIMATE_AFTER_MS = 300;
 
-// Seconds for each step of finished trainings of a preset here; null if there was none.
-function secondsPerStep(jobs, preset) {
-  const done = jobs.find(({ spec, state }) => spec.kind === "train" && spec.preset === preset && state === "succeeded");
+// Seconds for each step of finished trainings here with the same start, a preset or a model; null if there was none.
+function secondsPerStep(jobs, start) {
+  const done = jobs.find(({ spec, state }) => spec.kind === "train" && spec.preset === start.preset && spec.from === start.from && state === "succeeded");
   return done && done.progress.total ? (done.ended_unix_s - done.started_unix_s) / done.progress.total : null;
 }
 
-function NewTraining({ datasets, jobs, submit }) {
+function NewTraining({ models, datasets, jobs, submit }) {
   const presets = usePresets();
-  const [form, setForm] = useState({ dataset: datasets[0].name, preset: "", name: "", steps: "", settings: "" });
+  const [form, setForm] = useState({ dataset: datasets[0].name, from: "", preset: "", name: "", steps: "", settings: "" });
   const dataset = datasets.find(({ name }) => name === form.dataset) ?? datasets[0];
   const preset = form.preset || proposedPreset(dataset);
   const set = name => event => setForm({ ...form, [name]: event.target.value });
   const { settings, wrong } = settingsOf(form.settings, form.steps);
-  const spec = { kind: "train", name: form.name || dataset.name, preset, dataset: dataset.name, ...(Object.keys(settings).length && { settings }) };
-  const pace_s = secondsPerStep(jobs, preset);
+  const start = form.from ? { from: form.from } : { preset };
+  const spec = { kind: "train", name: form.name || dataset.name, ...start, dataset: dataset.name, ...(Object.keys(settings).length && { settings }) };
+  const pace_s = secondsPerStep(jobs, start);
+  const kind = form.from ? "start" : "preset";
   const { needs, wrong: refused } = useEstimate(spec);
-  const time = !pace_s ? "Time: not known, since no training of this preset has finished here yet; the job tells it after its first steps."
-    : needs ? `Time: about ${duration(pace_s * needs.steps)} for ${needs.steps} steps, from the last training of this preset here.`
-    : `Time: ${(1000 * pace_s).toFixed(0)} ms a step in the last training of this preset here.`;
+  const time = !pace_s ? `Time: not known, since no training of this ${kind} has finished here yet; the job tells it after its first steps.`
+    : needs ? `Time: about ${duration(pace_s * needs.steps)} for ${needs.steps} steps, from the last training of this ${kind} here.`
+    : `Time: ${(1000 * pace_s).toFixed(0)} ms a step in the last training of this ${kind} here.`;
   const limit = needs?.memory_limit_mib ? ` of ${memory(needs.memory_limit_mib)} that a job may use` : "";
   const room = needs ? `Memory: at least ${memory(needs.memory_mib)}${limit}.` : "";
   const is_refused = needs?.memory_limit_mib > 0 && needs.memory_mib > needs.memory_limit_mib;
   return html`<form class="card" onSubmit=${event => { event.preventDefault(); if (!wrong) submit(spec); }}><h2>New training</h2><div class="form">
       <label>Data set <select value=${dataset.name} onChange=${set("dataset")}>${datasets.map(({ name }) => html`<option value=${name}>${name}</option>`)}</select></label>
-      <label>Preset <select value=${preset} onChange=${set("preset")}>${(presets.length ? presets : [preset]).map(name => html`<option value=${name}>${name}</option>`)}</select></label>
+      <label>Start from <select value=${form.from} onChange=${set("from")}><option value="">new weights</option>${models.map(({ name }) => html`<option value=${name}>${name}</option>`)}</select></label>
+      ${!form.from && html`<label>Preset <select value=${preset} onChange=${set("preset")}>${(presets.length ? presets : [preset]).map(name => html`<option value=${name}>${name}</option>`)}</select></label>`}
       <label>Name of the model <input value=${form.name} placeholder=${dataset.name} pattern="[a-z0-9][a-z0-9\\-]*" onInput=${set("name")} /></label>
-      <label>Steps <input type="number" min="1" value=${form.steps} placeholder="of the preset" onInput=${set("steps")} /></label>
+      <label>Steps <input type="number" min="1" value=${form.steps} placeholder=${`of the ${form.from ? "model" : "preset"}`} onInput=${set("steps")} /></label>
       <label class="wide">Other settings, one a line <textarea rows="2" value=${form.settings} placeholder="sequence.batch_size=16" onInput=${set("settings")} /></label>
     </div><p class="quiet estimate">${time} ${room}</p>${is_refused && html`<p class="wrong">It would be refused: use a smaller model or batch.</p>`}
     <p class="wrong" role="alert">${wrong || (refused && `It would be refused: ${refused}`)}</p>

@@ -13,7 +13,7 @@ use crate::server::http::page;
 use crate::server::http::problem::ApiError;
 use crate::server::state::App;
 use foreframe_jobs::jobs::memory::TrainingEstimate;
-use foreframe_jobs::jobs::pipeline::{report_key, run_key};
+use foreframe_jobs::jobs::pipeline::{base_manifest, report_key, run_key};
 use foreframe_jobs::jobs::{Job, JobError, JobFilter, JobSpec, JobState};
 use foreframe_jobs::store::{Author, JobId, LogRow, LossRow};
 use foreframe_train::training::SAMPLE_FILE;
@@ -142,7 +142,9 @@ async fn estimate(app: App, Json(spec): Json<JobSpec>) -> Result<axum::Json<Trai
         return Err(ApiError::Unprocessable(detail));
     };
     let memory = app.config().job_resources().memory;
-    Ok(axum::Json(memory.estimate(&spec, app.store().objects()).await?))
+    let base = base_manifest(&spec, app.versions()).await?;
+    let estimate = memory.estimate(&spec, base.as_ref(), app.store().objects()).await?;
+    Ok(axum::Json(estimate))
 }
 
 /// Lists jobs, the newest first.

@@ -4,6 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{JobError, TrainSpec, datasets};
 use crate::store::Objects;
+use foreframe_core::registry::Manifest;
 use foreframe_data::dataset::DatasetInfo;
 use foreframe_train::training::TrainConfig;
 use foreframe_train::training::config::{ArchitectureConfig, CodecStart};
@@ -45,8 +46,14 @@ impl JobMemory {
         }
     }
 
-    /// What a training will need, without starting it. Errors: `Invalid`, `NotFound`, and those of reading the data sets.
-    pub async fn estimate(self, spec: &TrainSpec, objects: &Objects) -> Result<TrainingEstimate, JobError> {
+    /// What a training will need, without starting it; `base` is the model that it starts from, if it names one. Errors: `Invalid`,
+    /// `NotFound`, and those of reading the data sets.
+    pub async fn estimate(
+        self,
+        spec: &TrainSpec,
+        base: Option<&Manifest>,
+        objects: &Objects,
+    ) -> Result<TrainingEstimate, JobError> {
         spec.sweep
             .check()
             .map_err(|error| JobError::invalid("sweep", error.to_string()))?;
@@ -60,7 +67,7 @@ impl JobMemory {
         }
         let (mut steps, mut memory_mib) = (0, 0);
         for training in trainings {
-            let config = training.config()?;
+            let config = training.config(base)?;
             steps += config.pretrain.steps + config.sequence.steps;
             memory_mib = memory_mib.max(training_mib(&config, &dataset, self.held_mib()));
         }
@@ -72,8 +79,13 @@ impl JobMemory {
     }
 
     /// Errors: `Invalid` if a training certainly needs more memory than a job can use, and those of an estimate.
-    pub(super) async fn check(self, spec: &TrainSpec, objects: &Objects) -> Result<(), JobError> {
-        self.check_needed(self.estimate(spec, objects).await?.memory_mib)
+    pub(super) async fn check(
+        self,
+        spec: &TrainSpec,
+        base: Option<&Manifest>,
+        objects: &Objects,
+    ) -> Result<(), JobError> {
+        self.check_needed(self.estimate(spec, base, objects).await?.memory_mib)
     }
 
     /// Errors: `Invalid` if a training on such a data set certainly needs more memory than a job can use.

@@ -2,6 +2,7 @@
 //! `runs/JOB` and publishes the next version of its model; an evaluation writes `reports/JOB`.
 
 mod adapt;
+mod base;
 mod collect;
 mod evaluate;
 mod import;
@@ -10,6 +11,7 @@ mod sweep;
 mod train;
 mod training_report;
 
+pub use self::base::base_manifest;
 use std::error::Error;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -143,9 +145,9 @@ impl Pipeline {
         });
         checked.await.unwrap_or(Err(JobError::Stopping))?;
         match spec {
-            // How much memory it needs, and which models fit, is known when its data set is made.
+            JobSpec::Train(spec) => self.check_training(spec, is_there).await,
+            // Which models fit is known when its data set is made.
             _ if !is_there => Ok(()),
-            JobSpec::Train(spec) => self.resources.memory.check(spec, objects).await,
             JobSpec::Adapt(spec) => self.check_adaptation(spec).await,
             JobSpec::Evaluate(spec) => self.check_evaluation(spec).await,
             JobSpec::Collect(_) | JobSpec::Import(_) => Ok(()),

@@ -182,19 +182,30 @@ impl JobSpec {
         }
     }
 
-    /// Whether this can be the specification of a job that was submitted as `submitted`. An adaptation that has started names the
+    /// The version of `from`, the model whose weights it starts from, where it names one.
+    pub(super) fn starting_version(&self) -> Option<u32> {
+        match self {
+            Self::Train(spec) => spec.from_version,
+            Self::Adapt(spec) => spec.from_version,
+            Self::Collect(_) | Self::Import(_) | Self::Evaluate(_) => None,
+        }
+    }
+
+    /// The same work from this version of `from`. It stays as it is if it starts from no model.
+    pub(super) fn with_starting_version(&self, version: Option<u32>) -> Self {
+        let mut spec = self.clone();
+        match &mut spec {
+            Self::Train(spec) if spec.from.is_some() => spec.from_version = version,
+            Self::Adapt(spec) => spec.from_version = version,
+            Self::Train(_) | Self::Collect(_) | Self::Import(_) | Self::Evaluate(_) => {}
+        }
+        spec
+    }
+
+    /// Whether this can be the specification of a job that was submitted as `submitted`. A job that has started names the
     /// version that it starts from, so a request without one also matches a job that was submitted with one.
     pub(super) fn matches_submitted(&self, submitted: &Self) -> bool {
-        match (self, submitted) {
-            (Self::Adapt(own), Self::Adapt(submitted)) => {
-                let from_version = submitted.from_version.or(own.from_version);
-                *own == AdaptSpec {
-                    from_version,
-                    ..submitted.clone()
-                }
-            }
-            _ => self == submitted,
-        }
+        *self == submitted.with_starting_version(submitted.starting_version().or(self.starting_version()))
     }
 
     /// Checks everything that can be checked before the work starts. Errors: `Invalid` and `NotFound`, which name the field;
@@ -203,7 +214,7 @@ impl JobSpec {
         match self {
             Self::Collect(spec) => spec.check(available),
             Self::Import(spec) => spec.check(available),
-            Self::Train(spec) => spec.check(available.datasets),
+            Self::Train(spec) => spec.check(available),
             Self::Adapt(spec) => spec.check(available),
             Self::Evaluate(spec) => spec.check(available),
         }
@@ -301,13 +312,31 @@ fn from<'de, D: Deserializer<'de>>(deserializer: D) -> Result<ModelName, D::Erro
     named("from", deserializer)
 }
 
+fn optional_from<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<ModelName>, D::Error> {
+    optional("from", deserializer)
+}
+
 fn model<'de, D: Deserializer<'de>>(deserializer: D) -> Result<ModelName, D::Error> {
     named("model", deserializer)
 }
 
 fn twin<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<ModelName>, D::Error> {
+    optional("twin", deserializer)
+}
+
+fn optional<'de, D: Deserializer<'de>>(field: &str, deserializer: D) -> Result<Option<ModelName>, D::Error> {
     let text = Option::<String>::deserialize(deserializer)?;
-    text.map(|text| named("twin", text.into_deserializer())).transpose()
+    text.map(|text| named(field, text.into_deserializer())).transpose()
+}
+
+/// Errors: `NotFound` if there is no model `from`, or no such version of it.
+fn check_from(from: &ModelName, version: Option<u32>, available: AvailableInputs<'_>) -> Result<(), JobError> {
+    check_known(("from", "model"), from, available.models.keys())?;
+    let versions = available.models.get(from).into_iter().flatten();
+    match &version {
+        Some(version) => check_known(("from_version", "version"), version, versions),
+        None => Ok(()),
+    }
 }
 
 fn check_dataset(name: &DatasetName, available: &[DatasetName]) -> Result<(), JobError> {
@@ -375,20 +404,23 @@ mod tests {
     }
 
     #[test]
-    fn an_adaptation_that_names_its_version_matches_one_that_does_not() {
-        let spec = |more: serde_json::Value| -> JobSpec {
-            let mut spec = serde_json::json!({"kind": "adapt", "name": "a", "dataset": "d"});
-            spec.as_object_mut().unwrap().extend(more.as_object().unwrap().clone());
-            serde_json::from_value(spec).unwrap()
-        };
-        let [any, first, second] = [
-            serde_json::json!({}),
-            serde_json::json!({"from_version": 1}),
-            serde_json::json!({"from_version": 2}),
-        ]
-        .map(spec);
-        assert!(first.matches_submitted(&any) && first.matches_submitted(&first) && !first.matches_submitted(&second));
-        assert!(!first.matches_submitted(&spec(serde_json::json!({"steps": 1}))));
+    fn a_job_that_names_its_version_matches_one_that_does_not() {
+        for kind in ["adapt", "train"] {
+            let spec = |more: serde_json::Value| -> JobSpec {
+                let mut spec = serde_json::json!({"kind": kind, "name": "a", "dataset": "d", "from": "m"});
+                spec.as_object_mut().unwrap().extend(more.as_object().unwrap().clone());
+                serde_json::from_value(spec).unwrap()
+            };
+            let [any, first, second] = [
+                serde_json::json!({}),
+                serde_json::json!({"from_version": 1}),
+                serde_json::json!({"from_version": 2}),
+            ]
+            .map(spec);
+            assert!(first.matches_submitted(&any) && first.matches_submitted(&first));
+            assert!(!first.matches_submitted(&second));
+            assert!(!first.matches_submitted(&spec(serde_json::json!({"after": "job-1"}))));
+        }
     }
 
     #[test]

@@ -6,15 +6,12 @@ use serde_json::json;
 
 use super::super::executor::{JobFailure, JobResult};
 use super::super::report::JobReporter;
-use super::super::retry_policy::RetryPolicy;
 use super::super::{AdaptSpec, JobError, JobSpec, datasets};
 use super::train::TrainingWork;
 use super::{Pipeline, failed};
-use crate::versions::VersionError;
 use foreframe_core::error_kind::{ErrorKind, HasErrorKind as _};
 use foreframe_core::error_text;
-use foreframe_core::registry::{self, Model, StoredWeights};
-use foreframe_core::types::ModelName;
+use foreframe_core::registry;
 use foreframe_data::dataset::DatasetInfo;
 use foreframe_train::adaptation::{AdaptError, Adaptation};
 
@@ -29,22 +26,17 @@ impl Pipeline {
         report.progress(0, 0, "reading the data set");
         let retry = self.retry_policy(report, cancelled);
         let dataset = self.dataset(&spec.dataset, self.resources.memory.held_mib(), &retry)?;
-        let version = match (spec.from_version, spec.after) {
-            (None, Some(after)) => retry.run(async || self.made_version(after, &spec.from).await)?,
-            (version, _) => version,
-        };
-        let (base, start) = retry.run(async || self.base(&spec.from, version).await)?;
-        let spec = &self.with_version(spec, base.manifest.version, &retry)?;
+        let base = self.base(&JobSpec::Adapt(spec.clone()), &spec.from, &retry)?;
         report.progress(0, 0, "looking at the recording");
-        let adaptation = retry.repeat(|| Adaptation::of(&base, dataset.clone(), &settings, cancelled))?;
+        let adaptation = retry.repeat(|| Adaptation::of(&base.model, dataset.clone(), &settings, cancelled))?;
         if let Some(camera) = &adaptation.camera {
             report.line(format!("camera, {camera}"));
         }
         let work = TrainingWork {
-            spec: JobSpec::Adapt(spec.clone()),
+            spec: base.spec,
             config: &adaptation.config,
             dataset: &adaptation.dataset,
-            start: Some(&start),
+            start: Some(&base.weights),
         };
         let (model_dir, manifest) = self.trained(&work, &retry)?;
         let steps = u64::from(spec.steps);
@@ -64,33 +56,6 @@ impl Pipeline {
         let mut metrics = manifest.metrics;
         metrics["adaptation"] = json!(scores);
         self.published(&spec.name, &model_dir, &metrics, &retry)
-    }
-
-    /// The job with the version that it starts from. The version is also written to the job, so that a later attempt starts from the
-    /// same one. Errors: `Cancelled` if the lease is lost.
-    fn with_version(&self, spec: &AdaptSpec, version: u32, retry: &RetryPolicy<'_>) -> Result<AdaptSpec, JobFailure> {
-        let with_version = AdaptSpec {
-            from_version: Some(version),
-            ..spec.clone()
-        };
-        if with_version == *spec {
-            return Ok(with_version);
-        }
-        let text = serde_json::to_string(&JobSpec::Adapt(with_version.clone())).map_err(|error| failed(&error))?;
-        let is_written = retry.run(async || self.store.set_spec(retry.report.lease(), &text).await)?;
-        is_written.then_some(with_version).ok_or(JobFailure::Cancelled)
-    }
-
-    /// The model to start from, and its weights; without a version, the active one.
-    async fn base(&self, name: &ModelName, version: Option<u32>) -> Result<(Model, StoredWeights), VersionError> {
-        let version = match version {
-            Some(version) => version,
-            None => self.versions.active(name).await?.unwrap_or_default(),
-        };
-        let base = self.versions.load(name, version).await?;
-        let mut start = registry::load_weights(&self.versions.directory(name, version).await?)?;
-        start.manifest.name.clone_from(name);
-        Ok((base, start))
     }
 
     /// Errors: `Invalid` if the model cannot be adapted, or not with these settings, or that needs too much memory.

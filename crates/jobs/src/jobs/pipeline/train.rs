@@ -42,9 +42,16 @@ impl Pipeline {
         report: &JobReporter,
         cancelled: &AtomicBool,
     ) -> Result<JobResult, JobFailure> {
-        let config = spec.config().map_err(|error| failed(&error))?;
         report.progress(0, 0, "reading the data set");
         let retry = self.retry_policy(report, cancelled);
+        let whole = JobSpec::Train(spec.clone());
+        let base = spec
+            .from
+            .as_ref()
+            .map(|from| self.base(&whole, from, &retry))
+            .transpose()?;
+        let config = spec.config(base.as_ref().map(|base| &base.weights.manifest));
+        let config = config.map_err(|error| failed(&error))?;
         let held_mib = self.resources.memory.held_mib() / (1 + spec.mixture.len() as u64);
         let opened = spec
             .datasets()
@@ -52,10 +59,10 @@ impl Pipeline {
         let opened = opened.collect::<Result<_, JobFailure>>()?;
         let dataset = Dataset::join(opened, config.lacking()).map_err(|error| failed(&error))?;
         let work = TrainingWork {
-            spec: JobSpec::Train(spec.clone()),
+            spec: base.as_ref().map_or(whole, |base| base.spec.clone()),
             config: &config,
             dataset: &dataset,
-            start: None,
+            start: base.as_ref().map(|base| &base.weights),
         };
         let (model_dir, manifest) = self.trained(&work, &retry)?;
         let steps = work.steps().iter().sum::<usize>() as u64;

@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::train::settings_text;
-use super::{AvailableInputs, check_dataset, check_known, check_range, dataset, from, name};
+use super::{AvailableInputs, check_dataset, check_from, check_range, dataset, from, name};
 use crate::jobs::JobError;
 use crate::store::JobId;
 use foreframe_core::types::{DatasetName, ModelName};
@@ -70,12 +70,7 @@ impl AdaptSpec {
         check_range("steps", self.steps as usize, 1..=MAX_STEPS as usize)?;
         self.settings()?;
         check_dataset(&self.dataset, available.datasets)?;
-        check_known(("from", "model"), &self.from, available.models.keys())?;
-        let versions = available.models.get(&self.from).into_iter().flatten();
-        match &self.from_version {
-            Some(version) => check_known(("from_version", "version"), version, versions),
-            None => Ok(()),
-        }
+        check_from(&self.from, self.from_version, available)
     }
 
     /// How the model is adapted. Errors: `Invalid`, which names the setting.

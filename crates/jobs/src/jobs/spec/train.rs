@@ -5,16 +5,19 @@ use std::iter;
 
 use serde::{Deserialize, Serialize};
 
-use super::{check_dataset, check_known, dataset, name};
+use super::{AvailableInputs, check_dataset, check_from, check_known, dataset, name, optional_from};
 use crate::jobs::JobError;
 use crate::store::JobId;
 use foreframe_core::error_text;
+use foreframe_core::registry::Manifest;
 use foreframe_core::types::{DatasetName, ModelName};
+use foreframe_train::settings::SettingsLayer;
 use foreframe_train::training::sweep::set_nested;
 use foreframe_train::training::{Sweep, TrainConfig, TrainError};
 
-/// A training: publishes the next version of the model `name`. A cancelled training resumes from its checkpoint. With `sweep`, it
-/// has one part for each combination of the values, and each part publishes a version.
+/// A training: publishes the next version of the model `name`. It starts with new weights and the settings of a `preset`, or goes
+/// on with the weights and settings of a model (`from`); one of the two must be there. A cancelled training resumes from its
+/// checkpoint. With `sweep`, it has one part for each combination of the values, and each part publishes a version.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct TrainSpec {
@@ -23,8 +26,17 @@ pub struct TrainSpec {
     #[schema(value_type = String, pattern = "^[a-z0-9][a-z0-9-]{0,63}$")]
     pub name: ModelName,
     /// The preset of its settings.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schema(schema_with = preset_schema)]
-    pub preset: String,
+    pub preset: Option<String>,
+    /// Instead of a preset: the model to start from. Its weights are trained further, with its settings. A few hundred steps are
+    /// often enough: `{"sequence": {"steps": 300}}`.
+    #[serde(default, skip_serializing_if = "Option::is_none", deserialize_with = "optional_from")]
+    #[schema(value_type = Option<String>)]
+    pub from: Option<ModelName>,
+    /// Its version. If it is absent, the job's first attempt sets it: the version that the job before it made, else the active one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub from_version: Option<u32>,
     /// Name of a data set in the data directory.
     #[serde(deserialize_with = "dataset")]
     #[schema(value_type = String)]
@@ -34,7 +46,7 @@ pub struct TrainSpec {
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     #[schema(value_type = BTreeMap<String, f64>)]
     pub mixture: BTreeMap<DatasetName, f64>,
-    /// Settings that replace those of the preset.
+    /// Settings that replace those of the preset, or of the model to start from.
     #[serde(default, skip_serializing_if = "serde_json::Map::is_empty")]
     #[schema(value_type = Object)]
     pub settings: serde_json::Map<String, serde_json::Value>,
@@ -54,18 +66,23 @@ pub struct TrainSpec {
 fn preset_schema() -> utoipa::openapi::Object {
     utoipa::openapi::ObjectBuilder::new()
         .schema_type(utoipa::openapi::Type::String)
-        .description(Some("The preset of its settings."))
+        .description(Some("The preset of its settings. Absent with `from`."))
         .enum_values(Some(TrainConfig::preset_names()))
         .build()
 }
 
 impl TrainSpec {
-    pub(super) fn check(&self, datasets: &[DatasetName]) -> Result<(), JobError> {
+    pub(super) fn check(&self, available: AvailableInputs<'_>) -> Result<(), JobError> {
+        let datasets = available.datasets;
         let sweep = self.sweep.check();
         sweep.map_err(|error| JobError::invalid("sweep", error.to_string()))?;
-        self.config()?;
-        for part in self.parts() {
-            part.config()?;
+        match &self.from {
+            // Its settings are known when the model is read.
+            Some(from) => {
+                self.check_start()?;
+                check_from(from, self.from_version, available)?;
+            }
+            None => self.check_settings(None)?,
         }
         check_dataset(&self.dataset, datasets)?;
         for (name, weight) in &self.mixture {
@@ -80,6 +97,32 @@ impl TrainSpec {
             }
         }
         Ok(())
+    }
+
+    /// Errors: `Invalid` unless it starts either with a preset or from a model.
+    fn check_start(&self) -> Result<(), JobError> {
+        match (&self.preset, &self.from) {
+            (Some(_), Some(_)) => Err(JobError::invalid(
+                "from",
+                "a training starts either with a preset or from a model; leave out preset or from",
+            )),
+            (None, None) => {
+                let known = TrainConfig::preset_names().join(", ");
+                let reason = format!("it is absent; name one of {known}, or a model to start from with from");
+                Err(JobError::invalid("preset", reason))
+            }
+            (Some(_), None) if self.from_version.is_some() => Err(JobError::invalid(
+                "from_version",
+                "it is the version of a model to start from, which from must name",
+            )),
+            _ => Ok(()),
+        }
+    }
+
+    /// Checks the settings of all its trainings. Errors: those of [`Self::config`].
+    pub(in crate::jobs) fn check_settings(&self, base: Option<&Manifest>) -> Result<(), JobError> {
+        self.config(base)?;
+        self.parts().iter().try_for_each(|part| part.config(base).map(drop))
     }
 
     /// All data sets with their weights.
@@ -108,11 +151,17 @@ impl TrainSpec {
         parts.collect()
     }
 
-    /// The preset with the job's settings. Errors: `Invalid`, which names the presets or the setting.
-    pub(in crate::jobs) fn config(&self) -> Result<TrainConfig, JobError> {
-        let text = settings_text(&self.settings)?;
-        let layered = TrainConfig::layered(&self.preset, Some(&text), &[]);
-        let config = layered.map_err(|error| match error {
+    /// The settings of the preset, or of the model to start from, under the job's. Errors: `Invalid`, which names the presets or the
+    /// setting.
+    pub(in crate::jobs) fn config(&self, base: Option<&Manifest>) -> Result<TrainConfig, JobError> {
+        self.check_start()?;
+        let layer = SettingsLayer::toml("settings", &settings_text(&self.settings)?);
+        let layer = layer.map_err(|error| JobError::invalid("settings", error.to_string()))?;
+        let config = match base {
+            Some(base) => TrainConfig::of_model(base, [layer]),
+            None => TrainConfig::from_layers(self.preset.as_deref().unwrap_or_default(), [layer]),
+        };
+        let config = config.map_err(|error| match error {
             TrainError::UnknownPreset { .. } => JobError::invalid("preset", error.to_string()),
             other => JobError::invalid("settings", error_text::with_causes(&other)),
         })?;
@@ -133,63 +182,80 @@ pub(super) fn settings_text(settings: &serde_json::Map<String, serde_json::Value
 
 #[cfg(test)]
 mod tests {
+    use std::path::Path;
+
     use super::*;
 
-    #[test]
-    fn an_unknown_preset_is_refused_with_the_available_ones() {
-        let spec = TrainSpec {
-            name: "a".parse().unwrap(),
-            preset: "papr".to_owned(),
-            dataset: "d".parse().unwrap(),
-            mixture: BTreeMap::new(),
-            settings: serde_json::Map::new(),
-            sweep: Sweep::default(),
-            after: None,
+    fn training(more: &serde_json::Value) -> TrainSpec {
+        let mut spec = serde_json::json!({"name": "m", "dataset": "a"});
+        spec.as_object_mut().unwrap().extend(more.as_object().unwrap().clone());
+        serde_json::from_value(spec).unwrap()
+    }
+
+    /// Checks a training where the data sets `a` and `b` and version 1 of the model `base` are there.
+    fn check(spec: &TrainSpec) -> Result<(), String> {
+        let available = AvailableInputs {
+            data_dir: Path::new("data"),
+            import_dir: None,
+            datasets: &["a", "b"].map(|name| name.parse().unwrap()),
+            models: &[("base".parse().unwrap(), vec![1])].into(),
         };
-        let error = spec.check(&[]).unwrap_err().to_string();
-        assert!(error.starts_with("preset: ") && error.contains("moving"), "{error}");
+        spec.check(available).map_err(|error| error.to_string())
+    }
+
+    #[test]
+    fn a_training_starts_with_a_preset_or_from_a_model() {
+        let refused = |more| check(&training(&more)).unwrap_err();
+        let unknown = refused(serde_json::json!({"preset": "papr"}));
+        assert!(
+            unknown.starts_with("preset: ") && unknown.contains("moving"),
+            "{unknown}"
+        );
+        let neither = refused(serde_json::json!({}));
+        assert!(
+            neither.starts_with("preset: it is absent; name one of paper, static"),
+            "{neither}"
+        );
+        let both = refused(serde_json::json!({"preset": "paper", "from": "base"}));
+        assert!(both.starts_with("from: a training starts either"), "{both}");
+        let version = refused(serde_json::json!({"preset": "paper", "from_version": 1}));
+        assert!(version.starts_with("from_version: it is the version"), "{version}");
+        let model = refused(serde_json::json!({"from": "bass"}));
+        assert!(model.contains("there is no model \"bass\"; there are: base"), "{model}");
+        let model = refused(serde_json::json!({"from": "base", "from_version": 2}));
+        assert!(model.starts_with("from_version: "), "{model}");
+        assert_eq!(
+            check(&training(&serde_json::json!({"from": "base", "from_version": 1}))),
+            Ok(())
+        );
     }
 
     #[test]
     fn a_sweep_is_a_training_for_each_combination() {
-        let spec = |sweep: serde_json::Value| -> TrainSpec {
+        let spec = |sweep: serde_json::Value| {
             let settings = serde_json::json!({"model": {"hidden": 8}, "seed": 9});
-            let spec = serde_json::json!({"name": "m", "preset": "paper", "dataset": "a", "settings": settings, "sweep": sweep});
-            serde_json::from_value(spec).unwrap()
+            training(&serde_json::json!({"preset": "paper", "settings": settings, "sweep": sweep}))
         };
         let swept = spec(serde_json::json!({"seed": [1, 2], "model.features": [4, 8]}));
-        let known = ["a".parse().unwrap()];
-        swept.check(&known).unwrap();
+        check(&swept).unwrap();
         let parts = swept.parts();
         let expected = serde_json::json!({"model": {"hidden": 8, "features": 4}, "seed": 2});
         assert_eq!(serde_json::Value::Object(parts[1].settings.clone()), expected);
-        assert_eq!((parts.len(), parts[1].config().unwrap().seed.0), (4, 2));
-        let refused = |sweep| spec(sweep).check(&known).unwrap_err().to_string();
+        assert_eq!((parts.len(), parts[1].config(None).unwrap().seed.0), (4, 2));
+        let refused = |sweep| check(&spec(sweep)).unwrap_err();
         assert!(refused(serde_json::json!({"seed": []})).starts_with("sweep: \"seed\" has no values"));
         assert!(refused(serde_json::json!({"model.hiden": [1]})).contains("hiden"));
     }
 
     #[test]
     fn a_mixture_names_other_data_sets_with_weights_above_0() {
-        let known: Vec<DatasetName> = ["a", "b"].map(|name| name.parse().unwrap()).into();
-        let check = |mixture: &[(&str, f64)]| {
-            let spec = TrainSpec {
-                name: "m".parse().unwrap(),
-                preset: "paper".to_owned(),
-                dataset: "a".parse().unwrap(),
-                mixture: mixture
-                    .iter()
-                    .map(|&(name, weight)| (name.parse().unwrap(), weight))
-                    .collect(),
-                settings: serde_json::Map::new(),
-                sweep: Sweep::default(),
-                after: None,
-            };
-            spec.check(&known).map_err(|error| error.to_string())
-        };
-        assert_eq!(check(&[("b", 0.3)]), Ok(()));
-        assert!(check(&[("b", 0.0)]).unwrap_err().contains("the weight of \"b\" is 0"));
-        assert!(check(&[("a", 1.0)]).unwrap_err().contains("is the data set itself"));
-        assert!(check(&[("c", 1.0)]).unwrap_err().starts_with("mixture: "));
+        let check = |mixture| check(&training(&serde_json::json!({"preset": "paper", "mixture": mixture})));
+        assert_eq!(check(serde_json::json!({"b": 0.3})), Ok(()));
+        let zero = check(serde_json::json!({"b": 0.0})).unwrap_err();
+        assert!(zero.contains("the weight of \"b\" is 0"), "{zero}");
+        let same = check(serde_json::json!({"a": 1.0})).unwrap_err();
+        assert!(same.contains("is the data set itself"), "{same}");
+        let unknown = check(serde_json::json!({"c": 1.0})).unwrap_err();
+        assert!(unknown.starts_with("mixture: "), "{unknown}");
     }
 }
