@@ -3,6 +3,7 @@
 
 mod catmull_rom;
 pub mod codec;
+pub(crate) mod difference;
 pub mod jpeg;
 pub mod preprocess;
 pub mod quality;

@@ -24,3 +24,36 @@ impl<R, F: FnOnce() -> R> WithSimd for Loop<F> {
         (self.0)()
     }
 }
+
+/// The whole part of a value from 0 to 2^22; 0 of NaN. `as i32` would convert one value after the other.
+#[inline(always)]
+pub(crate) fn whole(value: f32) -> i32 {
+    /// 1.5 · 2^23: after adding it, the low bits hold the nearest whole number.
+    const ROUND: f32 = 12_582_912.0;
+    // `max` turns NaN into 0.
+    let value = value.max(0.0);
+    let shifted = value + ROUND;
+    let nearest = shifted.to_bits().wrapping_sub(ROUND.to_bits()) as i32;
+    nearest - i32::from(shifted - ROUND > value)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn whole_parts_are_those_of_a_conversion() {
+        for step in 0..200_000 {
+            let value = step as f32 * 0.037;
+            assert_eq!(
+                [value, value.floor()].map(whole),
+                [value as i32, value as i32],
+                "{value}"
+            );
+        }
+        assert_eq!(
+            [0.0, 0.5, 1.5, 2.5, 4_194_303.0, f32::NAN].map(whole),
+            [0, 0, 1, 2, 4_194_303, 0]
+        );
+    }
+}

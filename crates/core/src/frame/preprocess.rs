@@ -6,7 +6,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::{Frame, FrameError};
-use crate::vectorized::vectorized;
+use crate::vectorized::{vectorized, whole};
 
 /// How frames are converted to the model's value range.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -72,8 +72,8 @@ impl Preprocess {
                 for (pixel, value) in pixels.iter_mut().zip(values) {
                     let value = value.clamp(0.0, 1.0);
                     let intensity = if self.invert { 1.0 - value } else { value };
-                    // The cast truncates, so adding 0.5 rounds.
-                    *pixel = (intensity * 255.0 + 0.5) as u8;
+                    // The nearest one: the fraction is cut off.
+                    *pixel = whole(intensity * 255.0 + 0.5) as u8;
                 }
             },
         );

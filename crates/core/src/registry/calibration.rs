@@ -10,8 +10,8 @@ use serde::{Deserialize, Serialize};
 pub use self::at_pose::{LookAtPose, POSE_FEATURES, pose_features};
 pub use self::context::{APPEARANCE, ContextStatistics};
 use crate::frame::Frame;
-use crate::frame::preprocess::scale;
 use crate::nn::ModelSpec;
+use crate::vectorized::vectorized;
 
 /// Numbers from which the error of a predicted frame is estimated, see [`RolloutInContext::error_inputs`].
 pub const ERROR_INPUTS: usize = 8;
@@ -282,7 +282,7 @@ impl RolloutInContext<'_> {
                 log_difference(code, last),
                 log_difference(code, previous),
                 seen_change,
-                context::log_edges(&scale(frame.pixels()), frame.width() as usize),
+                context::log_edges(frame),
                 self.context.edges,
                 self.context.still,
                 distance,
@@ -335,8 +335,11 @@ fn weighted_sum(weights: &[f32], values: &[f64]) -> f64 {
 
 /// ln(mean squared difference + [`FLOOR`]).
 fn log_difference(a: &[f32], b: &[f32]) -> f64 {
-    let sum: f32 = a.iter().zip(b).map(|(a, b)| (a - b) * (a - b)).sum();
-    (f64::from(sum) / a.len().max(1) as f64 + FLOOR).ln()
+    let sum = vectorized(
+        #[inline(always)]
+        || context::squared_difference(a, b),
+    );
+    (sum / a.len().max(1) as f64 + FLOOR).ln()
 }
 
 #[cfg(test)]

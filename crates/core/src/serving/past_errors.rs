@@ -5,7 +5,9 @@
 use std::collections::VecDeque;
 
 use crate::frame::Frame;
+use crate::frame::difference::squared_difference_of_bytes;
 use crate::registry::calibration::ExpectedError;
+use crate::vectorized::vectorized;
 
 /// Every so many pixels of a frame are compared, in both directions.
 const STRIDE: usize = 4;
@@ -157,16 +159,22 @@ fn middle(error: &ExpectedError) -> f32 {
 }
 
 fn sampled(frame: &Frame) -> Vec<u8> {
-    let rows = frame.pixels().chunks_exact(frame.width() as usize);
-    let rows = rows.skip(STRIDE / 2).step_by(STRIDE);
-    rows.flat_map(|row| row.iter().skip(STRIDE / 2).step_by(STRIDE))
-        .copied()
-        .collect()
+    let (width, height) = (frame.width() as usize, frame.height() as usize);
+    let mut sampled = Vec::with_capacity((width / STRIDE + 1) * (height / STRIDE + 1));
+    for row in frame.pixels().chunks_exact(width).skip(STRIDE / 2).step_by(STRIDE) {
+        let (groups, rest) = row.as_chunks::<STRIDE>();
+        sampled.extend(groups.iter().map(|group| group[STRIDE / 2]));
+        sampled.extend(rest.get(STRIDE / 2));
+    }
+    sampled
 }
 
 fn mean_squared_difference(a: &[u8], b: &[u8]) -> f32 {
-    let squares = a.iter().zip(b).map(|(&a, &b)| u64::from(a.abs_diff(b)).pow(2));
-    squares.sum::<u64>() as f32 / (255.0 * 255.0 * a.len().max(1) as f32)
+    let sum = vectorized(
+        #[inline(always)]
+        || squared_difference_of_bytes(a, b),
+    );
+    sum as f32 / (255.0 * 255.0 * a.len().max(1) as f32)
 }
 
 #[cfg(test)]

@@ -5,7 +5,7 @@
 use candle_core::{Result, Shape, Tensor, bail};
 
 use crate::nn::fused::{FusedOperation, Operand, apply};
-use crate::vectorized::vectorized;
+use crate::vectorized::{vectorized, whole};
 
 /// The four pixels around a place, and the shares of the right column and of the lower row.
 #[derive(Clone, Copy)]
@@ -109,18 +109,6 @@ impl ImageSize {
             moves: [(0.0..=last_x).contains(&x), (0.0..=last_y).contains(&y)],
         }
     }
-}
-
-/// The whole part of a value from 0 to 2^22; 0 of NaN. `as i32` would convert one value after the other.
-#[inline(always)]
-fn whole(value: f32) -> i32 {
-    /// 1.5 · 2^23: after adding it, the low bits hold the nearest whole number.
-    const ROUND: f32 = 12_582_912.0;
-    // `max` turns NaN into 0.
-    let value = value.max(0.0);
-    let shifted = value + ROUND;
-    let nearest = shifted.to_bits().wrapping_sub(ROUND.to_bits()) as i32;
-    nearest - i32::from(shifted - ROUND > value)
 }
 
 impl Neighbourhood {
@@ -263,22 +251,6 @@ mod tests {
         assert_eq!(size.around(-3.0, 9.0).sample(&image), 10.0);
         assert_eq!(size.around(1.5, 0.25).slopes(&image), [1.0, 10.0]);
         assert_eq!(size.around(-3.0, 0.5).slopes(&image), [0.0, 10.0]);
-    }
-
-    #[test]
-    fn whole_parts_are_those_of_a_conversion() {
-        for step in 0..200_000 {
-            let value = step as f32 * 0.037;
-            assert_eq!(
-                [value, value.floor()].map(whole),
-                [value as i32, value as i32],
-                "{value}"
-            );
-        }
-        assert_eq!(
-            [0.0, 0.5, 1.5, 2.5, 4_194_303.0, f32::NAN].map(whole),
-            [0, 0, 1, 2, 4_194_303, 0]
-        );
     }
 
     #[test]

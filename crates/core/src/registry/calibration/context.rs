@@ -1,9 +1,16 @@
 //! A few numbers that describe the last two frames of a context.
+// Loops with vector instructions include only functions that are inlined into them.
+#![allow(clippy::inline_always)]
+
+use std::f32::consts::SQRT_2;
 
 use candle_core::{Device, Tensor};
 
+use crate::frame::Frame;
+use crate::frame::difference::squared_difference_of_bytes;
 use crate::nn::tensors::with_values;
 use crate::nn::{Network, NnError};
+use crate::vectorized::vectorized;
 
 /// Cosine waves along each side, the constant one included.
 const WAVES: usize = 4;
@@ -11,6 +18,8 @@ const WAVES: usize = 4;
 const REACHES: [usize; 2] = [1, 4];
 /// Number of statistics of a frame's look: waves along both sides, and edges over each reach in both directions.
 pub const APPEARANCE: usize = WAVES * WAVES + 2 * REACHES.len();
+/// Sums that are made beside each other: a sum of its own for each value would wait for the one before it.
+const LANES: usize = 16;
 /// A pixel stands still if it changes by less than this, about five of 255 levels.
 const STILL: f32 = 0.02;
 /// Shares are kept this far from 0 and 1.
@@ -45,7 +54,8 @@ impl ContextStatistics {
         let share = (unchanged as f64 / last.len().max(1) as f64).clamp(SHARE_MARGIN, 1.0 - SHARE_MARGIN);
         Self {
             appearance,
-            edges: log_edges(last, width),
+            // The first reach is that of the next pixel.
+            edges: f64::midpoint(appearance[WAVES * WAVES], appearance[WAVES * WAVES + 1]),
             still: (share / (1.0 - share)).ln(),
         }
     }
@@ -82,28 +92,31 @@ fn write_waves(image: &[f32], width: usize, out: &mut [f64]) {
     let height = image.len() / width.max(1);
     let table = |side: usize| -> Vec<[f32; WAVES]> {
         let angle = |at: usize| std::f32::consts::PI * (at as f32 + 0.5) / side as f32;
-        let wave = |at, wave: usize| {
-            if wave == 0 {
-                1.0
-            } else {
-                std::f32::consts::SQRT_2 * (angle(at) * wave as f32).cos()
-            }
+        // The cosines of multiples of an angle follow from its own.
+        let waves = |cosine: f32| {
+            let second = 2.0 * cosine * cosine - 1.0;
+            let third = cosine * (2.0 * second - 1.0);
+            [1.0, SQRT_2 * cosine, SQRT_2 * second, SQRT_2 * third]
         };
-        (0..side)
-            .map(|at| std::array::from_fn(|index| wave(at, index)))
-            .collect()
+        (0..side).map(|at| waves(angle(at).cos())).collect()
     };
     let (across, down) = (table(width), table(height));
-    for (row, down) in image.chunks_exact(width.max(1)).zip(&down) {
-        let mut sums = [0.0f32; WAVES];
-        for (value, waves) in row.iter().zip(&across) {
-            for (sum, wave) in sums.iter_mut().zip(waves) {
-                *sum += value * wave;
-            }
-        }
-        for (out, down) in out.chunks_exact_mut(WAVES).zip(down) {
-            for (out, sum) in out.iter_mut().zip(sums) {
-                *out += f64::from(sum * down) / image.len() as f64;
+    let mut columns = vec![0.0f32; width];
+    for (wave, out) in out.chunks_exact_mut(WAVES).enumerate() {
+        columns.fill(0.0);
+        vectorized(
+            #[inline(always)]
+            || {
+                for (row, down) in image.chunks_exact(width.max(1)).zip(&down) {
+                    for (sum, value) in columns.iter_mut().zip(row) {
+                        *sum += value * down[wave];
+                    }
+                }
+            },
+        );
+        for (sum, across) in columns.iter().zip(&across) {
+            for (out, wave) in out.iter_mut().zip(across) {
+                *out += f64::from(sum * wave) / image.len() as f64;
             }
         }
     }
@@ -111,21 +124,58 @@ fn write_waves(image: &[f32], width: usize, out: &mut [f64]) {
 
 /// Logarithms of the mean squared difference of pixels that are `reach` apart, across and down.
 fn log_differences(image: &[f32], width: usize, reach: usize) -> [f64; 2] {
-    let square = |a: &f32, b: &f32| (a - b) * (a - b);
-    let (mut across, mut pairs) = (0.0f64, 0);
-    for row in image.chunks_exact(width.max(1)) {
-        let later = row.get(reach..).unwrap_or_default();
-        across += f64::from(row.iter().zip(later).map(|(a, b)| square(a, b)).sum::<f32>());
-        pairs += later.len();
-    }
-    let below = image.get(reach * width..).unwrap_or_default();
-    let down: f64 = image.iter().zip(below).map(|(a, b)| f64::from(square(a, b))).sum();
-    [(across, pairs), (down, below.len())].map(|(sum, count)| (sum / count.max(1) as f64 + super::FLOOR).ln())
+    let sums = vectorized(
+        #[inline(always)]
+        || {
+            let (mut across, mut pairs) = (0.0f64, 0);
+            for row in image.chunks_exact(width.max(1)) {
+                let later = row.get(reach..).unwrap_or_default();
+                across += squared_difference(row, later);
+                pairs += later.len();
+            }
+            let below = image.get(reach * width..).unwrap_or_default();
+            [(across, pairs), (squared_difference(image, below), below.len())]
+        },
+    );
+    sums.map(|(sum, count)| (sum / count.max(1) as f64 + super::FLOOR).ln())
 }
 
-/// Logarithm of the mean squared difference of neighbouring pixels.
-pub(super) fn log_edges(image: &[f32], width: usize) -> f64 {
-    let [across, down] = log_differences(image, width, 1);
+/// The sum of the squared differences of the values that both have.
+#[inline(always)]
+pub(super) fn squared_difference(a: &[f32], b: &[f32]) -> f64 {
+    let length = a.len().min(b.len());
+    let (a, a_rest) = a[..length].as_chunks::<LANES>();
+    let (b, b_rest) = b[..length].as_chunks::<LANES>();
+    let mut sums = [0.0f32; LANES];
+    for (a, b) in a.iter().zip(b) {
+        for lane in 0..LANES {
+            sums[lane] += (a[lane] - b[lane]) * (a[lane] - b[lane]);
+        }
+    }
+    for ((sum, a), b) in sums.iter_mut().zip(a_rest).zip(b_rest) {
+        *sum += (a - b) * (a - b);
+    }
+    sums.into_iter().map(f64::from).sum()
+}
+
+/// Logarithm of the mean squared difference of neighbouring pixels, intensities 0…1.
+pub(super) fn log_edges(frame: &Frame) -> f64 {
+    let (pixels, width) = (frame.pixels(), frame.width() as usize);
+    let (mut across, mut pairs) = (0, 0);
+    let down = vectorized(
+        #[inline(always)]
+        || {
+            for row in pixels.chunks_exact(width) {
+                across += squared_difference_of_bytes(row, &row[1..]);
+                pairs += width - 1;
+            }
+            squared_difference_of_bytes(pixels, &pixels[width..])
+        },
+    );
+    let [across, down] = [(across, pairs), (down, pixels.len() - width)].map(|(sum, pairs)| {
+        let mean = sum as f64 / (255.0 * 255.0 * pairs.max(1) as f64);
+        (mean + super::FLOOR).ln()
+    });
     f64::midpoint(across, down)
 }
 
@@ -139,6 +189,24 @@ mod tests {
         assert!((flat.appearance[0] - 0.5).abs() < 1e-6);
         assert!(flat.appearance[1..WAVES * WAVES].iter().all(|wave| wave.abs() < 1e-6));
         assert!(flat.still > 6.0);
+    }
+
+    #[test]
+    fn the_edges_of_a_frame_are_those_of_its_intensities() {
+        let pixels: Vec<u8> = (0..20 * 9).map(|at| (at * at * 7 % 256) as u8).collect();
+        let intensities: Vec<f32> = pixels.iter().map(|&pixel| f32::from(pixel) / 255.0).collect();
+        let [across, down] = log_differences(&intensities, 20, 1);
+        let frame = Frame::new(20, 9, pixels).unwrap();
+        assert!((log_edges(&frame) - f64::midpoint(across, down)).abs() < 1e-5);
+        let square = |a: f32, b: f32| f64::from((a - b) * (a - b));
+        let below: f64 = intensities
+            .iter()
+            .zip(&intensities[20..])
+            .map(|(a, b)| square(*a, *b))
+            .sum();
+        assert!((down - (below / 160.0 + super::super::FLOOR).ln()).abs() < 1e-5);
+        let line = Frame::new(1, 3, vec![0, 255, 0]).unwrap();
+        assert!((log_edges(&line) - f64::midpoint(super::super::FLOOR.ln(), 0.0)).abs() < 1e-5);
     }
 
     #[test]
