@@ -278,6 +278,10 @@ def a_training_is_watched(browser, server):
     form = page.locator("form", has_text="New training")
     expect(page.locator("form", has_text="New adaptation").get_by_label("Start from")).to_have_value("rooms")
     form.get_by_label("Preset").locator("option[value=paper]").wait_for(state="attached")
+    # The settings of a model take the place of a preset's.
+    form.get_by_label("Start from").select_option("static")
+    expect(form.get_by_label("Preset")).to_have_count(0)
+    form.get_by_label("Start from").select_option("new weights")
     form.get_by_label("Data set").select_option("room")
     form.get_by_label("Preset").select_option("static")
     form.get_by_label("Name of the model").fill("tiny")

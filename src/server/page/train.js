@@ -102,11 +102,11 @@ function NewTraining({ models, datasets, jobs, submit }) {
   const start = form.from ? { from: form.from } : { preset };
   const spec = { kind: "train", name: form.name || dataset.name, ...start, dataset: dataset.name, ...(Object.keys(settings).length && { settings }) };
   const pace_s = secondsPerStep(jobs, start);
-  const kind = form.from ? "start" : "preset";
+  const kind = form.from ? "from this model" : "of this preset";
   const { needs, wrong: refused } = useEstimate(spec);
-  const time = !pace_s ? `Time: not known, since no training of this ${kind} has finished here yet; the job tells it after its first steps.`
-    : needs ? `Time: about ${duration(pace_s * needs.steps)} for ${needs.steps} steps, from the last training of this ${kind} here.`
-    : `Time: ${(1000 * pace_s).toFixed(0)} ms a step in the last training of this ${kind} here.`;
+  const time = !pace_s ? `Time: not known, since no training ${kind} has finished here yet; the job tells it after its first steps.`
+    : needs ? `Time: about ${duration(pace_s * needs.steps)} for ${needs.steps} steps, from the last training ${kind} here.`
+    : `Time: ${(1000 * pace_s).toFixed(0)} ms a step in the last training ${kind} here.`;
   const limit = needs?.memory_limit_mib ? ` of ${memory(needs.memory_limit_mib)} that a job may use` : "";
   const room = needs ? `Memory: at least ${memory(needs.memory_mib)}${limit}.` : "";
   const is_refused = needs?.memory_limit_mib > 0 && needs.memory_mib > needs.memory_limit_mib;
