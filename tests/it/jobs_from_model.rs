@@ -17,8 +17,13 @@ async fn a_training_goes_on_from_a_model() {
         body.as_object_mut().unwrap().extend(more.as_object().unwrap().clone());
         body
     };
-    let unknown = post(&app, JOBS, &further(json!({}))).await.detail(422);
-    assert!(unknown.starts_with("from: there is no model \"fresh\""), "{unknown}");
+    for path in [JOBS, "/v1/jobs/estimate"] {
+        let unknown = post(&app, path, &further(json!({}))).await.detail(422);
+        assert!(
+            unknown.starts_with("from: there is no model \"fresh\"; there are: "),
+            "{unknown}"
+        );
+    }
 
     // The version that the job before it makes, with its settings but for its pre-training.
     assert_eq!(post(&app, JOBS, &train("fresh", 2)).await.status, 202);

@@ -330,9 +330,13 @@ fn optional<'de, D: Deserializer<'de>>(field: &str, deserializer: D) -> Result<O
 }
 
 /// Errors: `NotFound` if there is no model `from`, or no such version of it.
-fn check_from(from: &ModelName, version: Option<u32>, available: AvailableInputs<'_>) -> Result<(), JobError> {
-    check_known(("from", "model"), from, available.models.keys())?;
-    let versions = available.models.get(from).into_iter().flatten();
+pub(super) fn check_from(
+    from: &ModelName,
+    version: Option<u32>,
+    models: &BTreeMap<ModelName, Vec<u32>>,
+) -> Result<(), JobError> {
+    check_known(("from", "model"), from, models.keys())?;
+    let versions = models.get(from).into_iter().flatten();
     match &version {
         Some(version) => check_known(("from_version", "version"), version, versions),
         None => Ok(()),

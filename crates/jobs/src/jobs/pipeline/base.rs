@@ -2,6 +2,7 @@
 
 use super::super::executor::JobFailure;
 use super::super::retry_policy::RetryPolicy;
+use super::super::spec::check_from;
 use super::super::{JobError, JobSpec, TrainSpec};
 use super::{Pipeline, failed};
 use crate::versions::{VersionError, Versions};
@@ -60,7 +61,7 @@ impl Pipeline {
         }
         let base = match base_manifest(spec, &self.versions).await {
             Ok(base) => base,
-            Err(error) if error.kind() == ErrorKind::Away => return Err(error.into()),
+            Err(error) if error.kind() == ErrorKind::Away => return Err(error),
             // What cannot be read says so when the job runs.
             Err(_) => return Ok(()),
         };
@@ -75,10 +76,10 @@ impl Pipeline {
     }
 }
 
-/// The description of the model that a training starts from; `None` for new weights. Errors: those of [`Versions::manifest`].
-pub async fn base_manifest(spec: &TrainSpec, versions: &Versions) -> Result<Option<Manifest>, VersionError> {
-    match &spec.from {
-        Some(from) => versions.manifest(from, spec.from_version).await.map(Some),
-        None => Ok(None),
-    }
+/// The description of the model that a training starts from; `None` for new weights. Errors: `NotFound`, which names the field;
+/// those of [`Versions::manifest`].
+pub async fn base_manifest(spec: &TrainSpec, versions: &Versions) -> Result<Option<Manifest>, JobError> {
+    let Some(from) = &spec.from else { return Ok(None) };
+    check_from(from, spec.from_version, &versions.all().await?)?;
+    Ok(Some(versions.manifest(from, spec.from_version).await?))
 }

@@ -70,7 +70,7 @@ impl AdaptSpec {
         check_range("steps", self.steps as usize, 1..=MAX_STEPS as usize)?;
         self.settings()?;
         check_dataset(&self.dataset, available.datasets)?;
-        check_from(&self.from, self.from_version, available)
+        check_from(&self.from, self.from_version, available.models)
     }
 
     /// How the model is adapted. Errors: `Invalid`, which names the setting.

@@ -80,7 +80,7 @@ impl TrainSpec {
             // Its settings are known when the model is read.
             Some(from) => {
                 self.check_start()?;
-                check_from(from, self.from_version, available)?;
+                check_from(from, self.from_version, available.models)?;
             }
             None => self.check_settings(None)?,
         }
@@ -108,7 +108,7 @@ impl TrainSpec {
             )),
             (None, None) => {
                 let known = TrainConfig::preset_names().join(", ");
-                let reason = format!("it is absent; name one of {known}, or a model to start from with from");
+                let reason = format!("it is absent; name one of {known}, or name a model in from");
                 Err(JobError::invalid("preset", reason))
             }
             (Some(_), None) if self.from_version.is_some() => Err(JobError::invalid(
