@@ -72,7 +72,7 @@ impl Preprocess {
                 for (pixel, value) in pixels.iter_mut().zip(values) {
                     let value = value.clamp(0.0, 1.0);
                     let intensity = if self.invert { 1.0 - value } else { value };
-                    // The nearest one: the fraction is cut off.
+                    // `whole` cuts the fraction off, so adding 0.5 rounds.
                     *pixel = whole(intensity * 255.0 + 0.5) as u8;
                 }
             },

@@ -3,7 +3,7 @@
 mod adapt;
 mod evaluate;
 mod import;
-mod train;
+pub(super) mod train;
 
 use std::collections::BTreeMap;
 use std::ops::{Range, RangeInclusive};
@@ -327,20 +327,6 @@ fn twin<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<ModelName>,
 fn optional<'de, D: Deserializer<'de>>(field: &str, deserializer: D) -> Result<Option<ModelName>, D::Error> {
     let text = Option::<String>::deserialize(deserializer)?;
     text.map(|text| named(field, text.into_deserializer())).transpose()
-}
-
-/// Errors: `NotFound` if there is no model `from`, or no such version of it.
-pub(super) fn check_from(
-    from: &ModelName,
-    version: Option<u32>,
-    models: &BTreeMap<ModelName, Vec<u32>>,
-) -> Result<(), JobError> {
-    check_known(("from", "model"), from, models.keys())?;
-    let versions = models.get(from).into_iter().flatten();
-    match &version {
-        Some(version) => check_known(("from_version", "version"), version, versions),
-        None => Ok(()),
-    }
 }
 
 fn check_dataset(name: &DatasetName, available: &[DatasetName]) -> Result<(), JobError> {

@@ -18,7 +18,7 @@ const WAVES: usize = 4;
 const REACHES: [usize; 2] = [1, 4];
 /// Number of statistics of a frame's look: waves along both sides, and edges over each reach in both directions.
 pub const APPEARANCE: usize = WAVES * WAVES + 2 * REACHES.len();
-/// Sums that are made beside each other: a sum of its own for each value would wait for the one before it.
+/// Partial sums. With a single one, each addition would wait for the one before it.
 const LANES: usize = 16;
 /// A pixel stands still if it changes by less than this, about five of 255 levels.
 const STILL: f32 = 0.02;

@@ -2,7 +2,7 @@
 
 use super::super::executor::JobFailure;
 use super::super::retry_policy::RetryPolicy;
-use super::super::spec::check_from;
+use super::super::spec::train::check_from;
 use super::super::{JobError, JobSpec, TrainSpec};
 use super::{Pipeline, failed};
 use crate::versions::{VersionError, Versions};

@@ -2,8 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::train::settings_text;
-use super::{AvailableInputs, check_dataset, check_from, check_range, dataset, from, name};
+use super::train::{check_from, settings_text};
+use super::{AvailableInputs, check_dataset, check_range, dataset, from, name};
 use crate::jobs::JobError;
 use crate::store::JobId;
 use foreframe_core::types::{DatasetName, ModelName};

@@ -5,7 +5,7 @@ use std::iter;
 
 use serde::{Deserialize, Serialize};
 
-use super::{AvailableInputs, check_dataset, check_from, check_known, dataset, name, optional_from};
+use super::{AvailableInputs, check_dataset, check_known, dataset, name, optional_from};
 use crate::jobs::JobError;
 use crate::store::JobId;
 use foreframe_core::error_text;
@@ -169,6 +169,20 @@ impl TrainSpec {
             name: self.name.clone(),
             ..config
         })
+    }
+}
+
+/// Errors: `NotFound` if there is no model `from`, or no such version of it.
+pub(in crate::jobs) fn check_from(
+    from: &ModelName,
+    version: Option<u32>,
+    models: &BTreeMap<ModelName, Vec<u32>>,
+) -> Result<(), JobError> {
+    check_known(("from", "model"), from, models.keys())?;
+    let versions = models.get(from).into_iter().flatten();
+    match &version {
+        Some(version) => check_known(("from_version", "version"), version, versions),
+        None => Ok(()),
     }
 }
 
