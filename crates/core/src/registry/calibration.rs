@@ -10,6 +10,7 @@ use serde::{Deserialize, Serialize};
 pub use self::at_pose::{LookAtPose, POSE_FEATURES, pose_features};
 pub use self::context::{APPEARANCE, ContextStatistics};
 use crate::frame::Frame;
+use crate::frame::difference::squared_difference;
 use crate::nn::ModelSpec;
 use crate::vectorized::vectorized;
 
@@ -337,7 +338,7 @@ fn weighted_sum(weights: &[f32], values: &[f64]) -> f64 {
 fn log_difference(a: &[f32], b: &[f32]) -> f64 {
     let sum = vectorized(
         #[inline(always)]
-        || context::squared_difference(a, b),
+        || squared_difference(a, b),
     );
     (sum / a.len().max(1) as f64 + FLOOR).ln()
 }

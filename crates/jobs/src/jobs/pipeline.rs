@@ -11,7 +11,6 @@ mod sweep;
 mod train;
 mod training_report;
 
-pub use self::base::base_manifest;
 use std::error::Error;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -21,6 +20,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 use tokio::runtime::Handle;
 
+pub use self::base::base_manifest;
 use super::executor::{JobExecutor, JobFailure, JobResult};
 use super::memory::JobMemory;
 use super::report::JobReporter;

@@ -7,7 +7,7 @@ use std::f32::consts::SQRT_2;
 use candle_core::{Device, Tensor};
 
 use crate::frame::Frame;
-use crate::frame::difference::squared_difference_of_bytes;
+use crate::frame::difference::{squared_difference, squared_difference_of_bytes};
 use crate::nn::tensors::with_values;
 use crate::nn::{Network, NnError};
 use crate::vectorized::vectorized;
@@ -18,8 +18,6 @@ const WAVES: usize = 4;
 const REACHES: [usize; 2] = [1, 4];
 /// Number of statistics of a frame's look: waves along both sides, and edges over each reach in both directions.
 pub const APPEARANCE: usize = WAVES * WAVES + 2 * REACHES.len();
-/// Partial sums. With a single one, each addition would wait for the one before it.
-const LANES: usize = 16;
 /// A pixel stands still if it changes by less than this, about five of 255 levels.
 const STILL: f32 = 0.02;
 /// Shares are kept this far from 0 and 1.
@@ -138,24 +136,6 @@ fn log_differences(image: &[f32], width: usize, reach: usize) -> [f64; 2] {
         },
     );
     sums.map(|(sum, count)| (sum / count.max(1) as f64 + super::FLOOR).ln())
-}
-
-/// The sum of the squared differences of the values that both have.
-#[inline(always)]
-pub(super) fn squared_difference(a: &[f32], b: &[f32]) -> f64 {
-    let length = a.len().min(b.len());
-    let (a, a_rest) = a[..length].as_chunks::<LANES>();
-    let (b, b_rest) = b[..length].as_chunks::<LANES>();
-    let mut sums = [0.0f32; LANES];
-    for (a, b) in a.iter().zip(b) {
-        for lane in 0..LANES {
-            sums[lane] += (a[lane] - b[lane]) * (a[lane] - b[lane]);
-        }
-    }
-    for ((sum, a), b) in sums.iter_mut().zip(a_rest).zip(b_rest) {
-        *sum += (a - b) * (a - b);
-    }
-    sums.into_iter().map(f64::from).sum()
 }
 
 /// Logarithm of the mean squared difference of neighbouring pixels, intensities 0…1.

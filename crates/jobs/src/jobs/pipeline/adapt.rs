@@ -27,8 +27,10 @@ impl Pipeline {
         let retry = self.retry_policy(report, cancelled);
         let dataset = self.dataset(&spec.dataset, self.resources.memory.held_mib(), &retry)?;
         let base = self.base(&JobSpec::Adapt(spec.clone()), &spec.from, &retry)?;
+        let version = base.weights.manifest.version;
+        let model = retry.run(async || self.versions.load(&spec.from, version).await)?;
         report.progress(0, 0, "looking at the recording");
-        let adaptation = retry.repeat(|| Adaptation::of(&base.model, dataset.clone(), &settings, cancelled))?;
+        let adaptation = retry.repeat(|| Adaptation::of(&model, dataset.clone(), &settings, cancelled))?;
         if let Some(camera) = &adaptation.camera {
             report.line(format!("camera, {camera}"));
         }

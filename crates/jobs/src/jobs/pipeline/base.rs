@@ -7,12 +7,11 @@ use super::super::{JobError, JobSpec, TrainSpec};
 use super::{Pipeline, failed};
 use crate::versions::{VersionError, Versions};
 use foreframe_core::error_kind::{ErrorKind, HasErrorKind as _};
-use foreframe_core::registry::{self, Manifest, Model, StoredWeights};
+use foreframe_core::registry::{self, Manifest, StoredWeights};
 use foreframe_core::types::ModelName;
 
-/// Where a job starts.
+/// The model that a job starts from.
 pub(super) struct Base {
-    pub(super) model: Model,
     pub(super) weights: StoredWeights,
     /// The job, with the version that it starts from.
     pub(super) spec: JobSpec,
@@ -26,8 +25,8 @@ impl Pipeline {
             (None, Some(after)) => retry.run(async || self.made_version(after, from).await)?,
             (version, _) => version,
         };
-        let (model, weights) = retry.run(async || self.load_base(from, version).await)?;
-        let with_version = spec.with_starting_version(Some(model.manifest.version));
+        let weights = retry.run(async || self.load_base(from, version).await)?;
+        let with_version = spec.with_starting_version(Some(weights.manifest.version));
         if with_version != *spec {
             let text = serde_json::to_string(&with_version).map_err(|error| failed(&error))?;
             let is_written = retry.run(async || self.store.set_spec(retry.report.lease(), &text).await)?;
@@ -36,21 +35,27 @@ impl Pipeline {
             }
         }
         Ok(Base {
-            model,
             weights,
             spec: with_version,
         })
     }
 
-    async fn load_base(&self, name: &ModelName, version: Option<u32>) -> Result<(Model, StoredWeights), VersionError> {
+    async fn load_base(&self, name: &ModelName, version: Option<u32>) -> Result<StoredWeights, VersionError> {
         let version = match version {
             Some(version) => version,
             None => self.versions.active(name).await?.unwrap_or_default(),
         };
-        let model = self.versions.load(name, version).await?;
         let mut weights = registry::load_weights(&self.versions.directory(name, version).await?)?;
+        let found = weights.manifest.version;
+        if found != version {
+            return Err(VersionError::Refused {
+                model: name.clone(),
+                version,
+                reason: format!("its manifest is of version {found}"),
+            });
+        }
         weights.manifest.name.clone_from(name);
-        Ok((model, weights))
+        Ok(weights)
     }
 
     /// Errors: `Invalid` if settings of a training are wrong, or it certainly needs too much memory.

@@ -44,11 +44,11 @@ impl Pipeline {
     ) -> Result<JobResult, JobFailure> {
         report.progress(0, 0, "reading the data set");
         let retry = self.retry_policy(report, cancelled);
-        let whole = JobSpec::Train(spec.clone());
+        let job = JobSpec::Train(spec.clone());
         let base = spec
             .from
             .as_ref()
-            .map(|from| self.base(&whole, from, &retry))
+            .map(|from| self.base(&job, from, &retry))
             .transpose()?;
         let config = spec.config(base.as_ref().map(|base| &base.weights.manifest));
         let config = config.map_err(|error| failed(&error))?;
@@ -59,7 +59,7 @@ impl Pipeline {
         let opened = opened.collect::<Result<_, JobFailure>>()?;
         let dataset = Dataset::join(opened, config.lacking()).map_err(|error| failed(&error))?;
         let work = TrainingWork {
-            spec: base.as_ref().map_or(whole, |base| base.spec.clone()),
+            spec: base.as_ref().map_or(job, |base| base.spec.clone()),
             config: &config,
             dataset: &dataset,
             start: base.as_ref().map(|base| &base.weights),
