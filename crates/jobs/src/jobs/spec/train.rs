@@ -15,8 +15,8 @@ use foreframe_train::settings::SettingsLayer;
 use foreframe_train::training::sweep::set_nested;
 use foreframe_train::training::{Sweep, TrainConfig, TrainError};
 
-/// A training: publishes the next version of the model `name`. It starts with new weights and the settings of a `preset`, or goes
-/// on with the weights and settings of a model (`from`); one of the two must be there. A cancelled training resumes from its
+/// A training: publishes the next version of the model `name`. It starts with new weights and the settings of a `preset`, or from
+/// the weights of a model and with its settings (`from`); one of the two must be there. A cancelled training resumes from its
 /// checkpoint. With `sweep`, it has one part for each combination of the values, and each part publishes a version.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
@@ -29,12 +29,13 @@ pub struct TrainSpec {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schema(schema_with = preset_schema)]
     pub preset: Option<String>,
-    /// Instead of a preset: the model to start from. Its weights are trained further, with its settings. A few hundred steps are
-    /// often enough: `{"sequence": {"steps": 300}}`.
+    /// Instead of a preset: the model to start from (fine-tuning). Its settings count but for the pre-training, which is left out. A
+    /// few hundred steps are often enough: `{"sequence": {"steps": 300}}`.
     #[serde(default, skip_serializing_if = "Option::is_none", deserialize_with = "optional_from")]
     #[schema(value_type = Option<String>)]
     pub from: Option<ModelName>,
     /// Its version. If it is absent, the job's first attempt sets it: the version that the job before it made, else the active one.
+    /// Each training of a sweep sets its own.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub from_version: Option<u32>,
     /// Name of a data set in the data directory.
@@ -113,7 +114,7 @@ impl TrainSpec {
             }
             (Some(_), None) if self.from_version.is_some() => Err(JobError::invalid(
                 "from_version",
-                "it is the version of a model to start from, which from must name",
+                "it is the version of a model to start from; name that model in from",
             )),
             _ => Ok(()),
         }
