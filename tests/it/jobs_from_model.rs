@@ -4,7 +4,7 @@ use foreframe::server::ServerConfig;
 use serde_json::{Value, json};
 
 use crate::jobs_end_to_end::{JOBS, collect_data_set, run_job, train, wait_for_version};
-use crate::service::{app, post};
+use crate::service::{app, get, poll_until, post};
 
 #[tokio::test]
 async fn a_training_goes_on_from_a_model() {
@@ -62,4 +62,36 @@ async fn a_training_goes_on_from_a_model() {
     assert!(both.starts_with("from: a training starts either"), "{both}");
     let version = post(&app, JOBS, &further(json!({"from_version": 9}))).await.detail(422);
     assert_eq!(version, "from_version: there is no version \"9\"; there are: 1");
+}
+
+#[tokio::test]
+async fn memory_is_checked_when_the_model_to_start_from_is_there() {
+    let dir = tempfile::tempdir().unwrap();
+    let config = ServerConfig {
+        job_memory_mib: 1024,
+        ..ServerConfig::default()
+    };
+    let app = app(dir.path(), config);
+    collect_data_set(&app).await;
+    run_job(&app, &train("fresh", 2)).await;
+    let mut large = json!({"kind": "train", "name": "large", "from": "fresh", "dataset": "seen", "after": "job-2",
+        "settings": {"sequence": {"steps": 2, "batch_size": 4096}}});
+    assert_eq!(post(&app, JOBS, &large).await.status, 202);
+    let failed = poll_until(async || {
+        let job = get(&app, "/v1/jobs/job-3").await.json();
+        (job["state"] == "failed").then_some(job)
+    })
+    .await;
+    let expected = "settings: the training needs at least ";
+    assert!(failed["error"].as_str().unwrap().starts_with(expected), "{failed}");
+    large["from_version"] = json!(1);
+    assert!(post(&app, JOBS, &large).await.detail(422).starts_with(expected));
+
+    // Principal components, of which weights that are there have no need, take memory.
+    let needs = async |body: Value| {
+        let estimate = post(&app, "/v1/jobs/estimate", &body).await.json();
+        estimate["memory_mib"].as_u64().unwrap()
+    };
+    let further = json!({"kind": "train", "name": "large", "from": "fresh", "dataset": "seen"});
+    assert!(needs(further).await < needs(train("fresh", 2)).await);
 }

@@ -67,7 +67,11 @@ impl JobMemory {
         }
         let (mut steps, mut memory_mib) = (0, 0);
         for training in trainings {
-            let config = training.config(base)?;
+            let mut config = training.config(base)?;
+            if base.is_some() {
+                // Only new weights are computed from principal components.
+                config.pretrain.start = CodecStart::Random;
+            }
             steps += config.pretrain.steps + config.sequence.steps;
             memory_mib = memory_mib.max(training_mib(&config, &dataset, self.held_mib()));
         }

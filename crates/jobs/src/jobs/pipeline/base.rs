@@ -81,10 +81,14 @@ impl Pipeline {
     }
 }
 
-/// The description of the model that a training starts from; `None` for new weights. Errors: `NotFound`, which names the field;
-/// those of [`Versions::manifest`].
+/// The description of the model that a training starts from; `None` for new weights. Errors: `NotFound` and `Invalid`, which name the
+/// field; those of a store that is away.
 pub async fn base_manifest(spec: &TrainSpec, versions: &Versions) -> Result<Option<Manifest>, JobError> {
     let Some(from) = &spec.from else { return Ok(None) };
     check_from(from, spec.from_version, &versions.all().await?)?;
-    Ok(Some(versions.manifest(from, spec.from_version).await?))
+    match versions.manifest(from, spec.from_version).await {
+        Ok(manifest) => Ok(Some(manifest)),
+        Err(error) if error.kind() == ErrorKind::Away => Err(error.into()),
+        Err(error) => Err(JobError::invalid("from", error.to_string())),
+    }
 }

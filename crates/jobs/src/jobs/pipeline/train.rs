@@ -50,8 +50,13 @@ impl Pipeline {
             .as_ref()
             .map(|from| self.base(&job, from, &retry))
             .transpose()?;
-        let config = spec.config(base.as_ref().map(|base| &base.weights.manifest));
-        let config = config.map_err(|error| failed(&error))?;
+        let manifest = base.as_ref().map(|base| &base.weights.manifest);
+        let config = spec.config(manifest).map_err(|error| failed(&error))?;
+        if manifest.is_some() {
+            // When it was submitted, the version was perhaps not there yet.
+            let memory = self.resources.memory;
+            retry.run(async || memory.check(spec, manifest, self.store.objects()).await)?;
+        }
         let held_mib = self.resources.memory.held_mib() / (1 + spec.mixture.len() as u64);
         let opened = spec
             .datasets()

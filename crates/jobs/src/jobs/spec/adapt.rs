@@ -33,6 +33,7 @@ pub struct AdaptSpec {
     pub from: ModelName,
     /// Its version. If it is absent, the job's first attempt sets it: the version that the job before it made, else the active one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schema(minimum = 1)]
     pub from_version: Option<u32>,
     /// Updates, of 16 windows each, 1 to 100,000; the weights with the least validation error are kept.
     #[serde(default = "default_steps")]

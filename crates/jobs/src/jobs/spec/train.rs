@@ -37,6 +37,7 @@ pub struct TrainSpec {
     /// Its version. If it is absent, the job's first attempt sets it: the version that the job before it made, else the active one.
     /// Each training of a sweep sets its own.
     #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schema(minimum = 1)]
     pub from_version: Option<u32>,
     /// Name of a data set in the data directory.
     #[serde(deserialize_with = "dataset")]
