@@ -65,7 +65,8 @@ pub(super) fn run(args: &AdaptArgs) -> Result<(), CliError> {
     let (directory, dataset) = workspace.open_dataset(&args.dataset)?;
     let settings = settings(args, &dataset.info().name)?;
     let cancelled = interrupt::flag()?;
-    let adaptation = Adaptation::of(&base, dataset, &settings, &cancelled).map_err(preparation_error)?;
+    let adaptation = Adaptation::of(&base, dataset, &settings, &cancelled)
+        .map_err(interrupted("stopped before the training; nothing was written"))?;
     if let Some(camera) = &adaptation.camera {
         print_line(format!(
             "camera, {camera}; import with --fov and --tilt if you know better"
@@ -81,7 +82,10 @@ pub(super) fn run(args: &AdaptArgs) -> Result<(), CliError> {
         cancelled: &cancelled,
     };
     let (model_dir, _) = training.run(config, &run_dir)?;
-    let scores = adaptation.judge(&registry::load(&model_dir)?)?;
+    let adapted = registry::load(&model_dir)?;
+    let scores = adaptation
+        .judge(&adapted, &cancelled)
+        .map_err(interrupted("stopped before the comparison; the same command goes on"))?;
     print_line(scores.table(&args.from, config.name.as_str()))?;
     if !scores.is_better() {
         fs::remove_dir_all(&run_dir).map_err(|error| CliError::io("delete", &run_dir, &error))?;
@@ -99,10 +103,10 @@ pub(super) fn run(args: &AdaptArgs) -> Result<(), CliError> {
     ))
 }
 
-/// Ctrl-C before the training is an interruption, not a failure.
-fn preparation_error(error: AdaptError) -> CliError {
-    match error.kind() {
-        ErrorKind::Cancelled => CliError::Interrupted("stopped before the training; nothing was written".to_owned()),
+/// Ctrl-C is an interruption, not a failure.
+fn interrupted(sentence: &'static str) -> impl Fn(AdaptError) -> CliError {
+    move |error| match error.kind() {
+        ErrorKind::Cancelled => CliError::Interrupted(sentence.to_owned()),
         _ => error.into(),
     }
 }

@@ -8,7 +8,7 @@ use std::sync::atomic::AtomicBool;
 use foreframe::server::ServerConfig;
 use foreframe_core::frame::codec;
 use foreframe_core::nn::Conditioning;
-use foreframe_data::dataset::Dataset;
+use foreframe_data::dataset::{Dataset, Split};
 use foreframe_train::evaluation::{self, EvaluationError};
 use serde_json::{Value, json};
 
@@ -155,7 +155,7 @@ fn rooms_is_scored_on_a_car_and_adapted_to_it_unless_it_gets_worse() {
 }
 
 #[test]
-fn a_set_flag_ends_the_estimate_of_the_camera() {
+fn a_set_flag_ends_the_estimate_of_the_camera_and_the_judging() {
     let dataset = moving_squares(30, SIDE, 0.2);
     let model = untrained("still", spec(Conditioning::None), &dataset);
     let estimated = |is_cancelled: bool| {
@@ -164,6 +164,13 @@ fn a_set_flag_ends_the_estimate_of_the_camera() {
     };
     assert!(estimated(false).unwrap().is_some());
     assert!(matches!(estimated(true), Err(EvaluationError::Cancelled)));
+    let windows = evaluation::windows_of(&model, &dataset, Split::Validation).unwrap();
+    let judged = |is_cancelled: bool| {
+        let cancelled = AtomicBool::new(is_cancelled);
+        evaluation::window_errors(&model, &dataset, &windows, 1, &cancelled)
+    };
+    assert_eq!(judged(false).unwrap().len(), windows.len());
+    assert!(matches!(judged(true), Err(EvaluationError::Cancelled)));
 }
 
 #[test]

@@ -2,6 +2,7 @@
 
 use std::path::Path;
 use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 
 use candle_core::{Device, Tensor};
 use foreframe_core::frame::Frame;
@@ -114,7 +115,7 @@ fn a_network_sees_how_fast_the_camera_turns() {
     let windows =
         foreframe_train::evaluation::windows_of(&model, &dataset, foreframe_data::dataset::Split::Test).unwrap();
     let mean = |dataset: &Dataset| {
-        let errors = window_errors(&model, dataset, &windows, spec.horizon).unwrap();
+        let errors = window_errors(&model, dataset, &windows, spec.horizon, &AtomicBool::new(false)).unwrap();
         errors.iter().sum::<f64>() / errors.len() as f64
     };
     let (known, unknown) = (mean(&dataset), mean(&turning("plain", 40, true)));

@@ -183,8 +183,9 @@ impl<'a> Adaptation<'a> {
         })
     }
 
-    /// How well the adapted model predicts windows that did not choose its weights. Errors: those of the network and of the data set.
-    pub fn judge(&self, adapted: &Model) -> Result<AdaptScores, AdaptError> {
+    /// How well the adapted model predicts windows that did not choose its weights. Errors: `Cancelled` of the evaluation,
+    /// those of the network and of the data set.
+    pub fn judge(&self, adapted: &Model, cancelled: &AtomicBool) -> Result<AdaptScores, AdaptError> {
         let mean_of = |model: &Model| -> Result<f64, AdaptError> {
             let horizon = model.spec().horizon;
             Ok(mean(&evaluation::window_errors(
@@ -192,6 +193,7 @@ impl<'a> Adaptation<'a> {
                 &self.dataset,
                 &self.windows,
                 horizon,
+                cancelled,
             )?))
         };
         Ok(AdaptScores {

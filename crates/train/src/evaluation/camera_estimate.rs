@@ -1,7 +1,7 @@
 //! Estimates the camera of a recording: the one with which a model that sees depth predicts its frames best.
 
 use std::fmt::{self, Display, Formatter};
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::AtomicBool;
 
 use super::EvaluationError;
 use super::statistics::mean_and_deviation;
@@ -93,12 +93,9 @@ pub fn estimate_camera(
         height_m: Some(height_m),
     };
     let try_one = |degrees: [f32; 2]| -> Result<TriedCamera, EvaluationError> {
-        if cancelled.load(Ordering::Acquire) {
-            return Err(EvaluationError::Cancelled);
-        }
         let with_camera = dataset.clone().with_camera(camera(degrees));
         // Later steps say less: their pictures blur with any camera.
-        let errors = window_errors(loaded, &with_camera, &windows, 1)?;
+        let errors = window_errors(loaded, &with_camera, &windows, 1, cancelled)?;
         Ok(TriedCamera { degrees, errors })
     };
     let first = FIELDS_OF_VIEW

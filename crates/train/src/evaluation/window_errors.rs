@@ -1,5 +1,7 @@
 //! How well single windows are predicted, without a report: to estimate a camera and to compare a model before and after.
 
+use std::sync::atomic::{AtomicBool, Ordering};
+
 use super::EvaluationError;
 use super::inference::{ActionSource, Inference};
 use super::windows::{true_frame, window_shape};
@@ -22,18 +24,22 @@ pub fn windows_of(loaded: &Model, dataset: &Dataset, split: Split) -> Result<Vec
     }
 }
 
-/// The mean squared error of each window's first `steps` predicted frames, intensities 0…1. Errors: those of the network and of
-/// [`Dataset::pixels`].
+/// The mean squared error of each window's first `steps` predicted frames, intensities 0…1. Errors: `Cancelled`, those of the network and
+/// of [`Dataset::pixels`].
 pub fn window_errors(
     loaded: &Model,
     dataset: &Dataset,
     windows: &[Window],
     steps: usize,
+    cancelled: &AtomicBool,
 ) -> Result<Vec<f64>, EvaluationError> {
     let inference = Inference { loaded, dataset };
     let each = loaded.spec().horizon * loaded.spec().pixels();
     let mut errors = Vec::with_capacity(windows.len());
     for windows in windows.chunks(TOGETHER) {
+        if cancelled.load(Ordering::Acquire) {
+            return Err(EvaluationError::Cancelled);
+        }
         let predicted = inference.predict(windows, ActionSource::Recorded)?;
         for (&window, frames) in windows.iter().zip(predicted.frames.chunks_exact(each)) {
             let all = inference.step_errors(window, frames)?;

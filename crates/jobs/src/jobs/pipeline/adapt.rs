@@ -44,7 +44,7 @@ impl Pipeline {
         let steps = u64::from(spec.steps);
         report.progress(steps, steps, "comparing");
         let adapted = retry.repeat(|| registry::load(&model_dir))?;
-        let scores = retry.repeat(|| adaptation.judge(&adapted))?;
+        let scores = retry.repeat(|| adaptation.judge(&adapted, cancelled))?;
         let table = scores.table(spec.from.as_str(), spec.name.as_str());
         table.lines().for_each(|line| report.line(line.to_owned()));
         if !scores.is_better() {
