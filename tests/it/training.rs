@@ -546,7 +546,7 @@ fn actions_that_never_change_are_refused_unless_allowed() {
     assert_eq!(
         refused.to_string(),
         "data set \"standing\" has actions that never change (its camera stands still); a model with conditioning \"action\" \
-         learns nothing from them: use a preset for a standing camera, or model.conditioning=none, or allow it with \
+         learns nothing from them: use a preset or a model for a standing camera, or model.conditioning=none, or allow it with \
          data.constant_actions=true"
     );
     let allowed = small_config(&[

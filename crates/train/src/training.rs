@@ -37,6 +37,7 @@ pub use self::journal::SAMPLE_FILE;
 pub use self::observer::{Observer, TrainingEvent, TrainingStage};
 use self::plan::{TrainingPlan, window_frames};
 use self::stage::{StageEnd, StageRunner};
+pub use self::start::check_start;
 use self::state::TrainState;
 pub use self::sweep::Sweep;
 use foreframe_core::files::write_atomically;
@@ -97,7 +98,7 @@ pub fn run(
     // Check the data before creating the directory, so that a refused training leaves no files.
     let plan = TrainingPlan::new(config, dataset)?;
     if let Some(start) = training.start {
-        start::parameters(&plan, start, config.seed)?;
+        start::parameters(&plan.spec, start, config.seed)?;
     }
     let _lock = files.lock()?;
     let model_dir = files.path(MODEL_DIR);
@@ -172,7 +173,7 @@ fn initial_parameters(
 ) -> Result<Option<Parameters>, TrainError> {
     let config = training.config;
     if let Some(start) = training.start {
-        return start::parameters(plan, start, config.seed).map(Some);
+        return start::parameters(&plan.spec, start, config.seed).map(Some);
     }
     let parameters = Parameters::initialize(&plan.spec, config.seed.derive("weights", 0))?;
     if plan.spec.flow().is_some() {

@@ -14,7 +14,7 @@ use foreframe_core::frame::warp::CameraModel;
 use foreframe_core::nn::loss::Loss;
 use foreframe_core::nn::{Architecture, ChannelScale, FlowSpec, ModelSpec};
 use foreframe_core::types::{Channel, ModelName, Seed};
-use foreframe_data::dataset::{Dataset, Lacking, sampler::WindowShape};
+use foreframe_data::dataset::{Dataset, DatasetInfo, Lacking, sampler::WindowShape};
 
 /// All settings of a training. Together with the data set, they determine the weights.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -298,22 +298,30 @@ impl TrainConfig {
     /// The model specification for this data set. Channels are scaled by their statistics over the given training frames.
     #[must_use]
     pub fn model_spec(&self, dataset: &Dataset, frames: &[usize]) -> ModelSpec {
-        let (info, model) = (dataset.info(), &self.model);
-        let actions = scales(&info.action_channels, frames, |frame| dataset.action(frame));
-        let states = scales(&info.state_channels, frames, |frame| dataset.state(frame));
-        let architecture = match model.architecture {
-            ArchitectureConfig::Dense(dense) => Architecture::Dense(dense),
-            ArchitectureConfig::Flow(layers) => Architecture::Flow(FlowSpec {
-                layers,
-                camera: if layers.depth {
-                    mean_camera(dataset).or(info.camera)
-                } else {
-                    info.camera
-                },
-            }),
-        };
+        let info = dataset.info();
+        let mut spec = self.unscaled_spec(info);
+        spec.actions = scales(&info.action_channels, frames, |frame| dataset.action(frame));
+        spec.states = scales(&info.state_channels, frames, |frame| dataset.state(frame));
+        if let Architecture::Flow(flow) = &mut spec.architecture
+            && flow.layers.depth
+        {
+            flow.camera = mean_camera(dataset).or(info.camera);
+        }
+        spec
+    }
+
+    /// As [`Self::model_spec`], without the statistics of the channels and without the cameras of the episodes.
+    pub(super) fn unscaled_spec(&self, info: &DatasetInfo) -> ModelSpec {
+        let model = &self.model;
+        let unscaled = |channels: &[Channel]| channels.iter().map(|channel| scaled(channel, 0.0, 1.0)).collect();
         ModelSpec {
-            architecture,
+            architecture: match model.architecture {
+                ArchitectureConfig::Dense(dense) => Architecture::Dense(dense),
+                ArchitectureConfig::Flow(layers) => Architecture::Flow(FlowSpec {
+                    layers,
+                    camera: info.camera,
+                }),
+            },
             frame_width_px: info.frame_width_px,
             frame_height_px: info.frame_height_px,
             frame_period_s: info.frame_period_s,
@@ -321,9 +329,18 @@ impl TrainConfig {
             context: model.context,
             horizon: model.horizon,
             conditioning: model.conditioning,
-            actions,
-            states,
+            actions: unscaled(&info.action_channels),
+            states: unscaled(&info.state_channels),
         }
+    }
+}
+
+fn scaled(channel: &Channel, mean: f32, std: f32) -> ChannelScale {
+    ChannelScale {
+        name: channel.name.clone(),
+        unit: channel.unit.clone(),
+        mean,
+        std,
     }
 }
 
@@ -356,12 +373,8 @@ fn scales<'a>(channels: &[Channel], frames: &[usize], values: impl Fn(usize) -> 
     let scale = |(index, channel): (usize, &Channel)| {
         let known = known(index);
         let mean = moment(&known, 1, 0.0);
-        ChannelScale {
-            name: channel.name.clone(),
-            unit: channel.unit.clone(),
-            mean: mean as f32,
-            std: (moment(&known, 2, mean).sqrt() as f32).max(1e-3),
-        }
+        let std = (moment(&known, 2, mean).sqrt() as f32).max(1e-3);
+        scaled(channel, mean as f32, std)
     };
     channels.iter().enumerate().map(scale).collect()
 }

@@ -66,7 +66,7 @@ pub enum TrainError {
     /// The model takes actions, but the data set has none that change.
     #[error(
         "data set \"{dataset}\" has {}; a model with conditioning \"{conditioning}\" learns nothing from them: use a preset \
-         for a standing camera, or model.conditioning=none{}",
+         or a model for a standing camera, or model.conditioning=none{}",
         if *has_actions { "actions that never change (its camera stands still)" } else { "no actions" },
         if *has_actions { ", or allow it with data.constant_actions=true" } else { "" }
     )]

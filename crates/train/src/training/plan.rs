@@ -74,7 +74,7 @@ impl<'a> TrainingPlan<'a> {
         let train = kept;
         let frames = window_frames(&train, shape.context + shape.horizon);
         let spec = config.model_spec(dataset, &frames);
-        check_channels(dataset, &spec)?;
+        check_channels(&dataset.info().name, &spec)?;
         check_actions(config, dataset, &spec)?;
         check_movers(config, dataset, &spec)?;
         spec.validate()?;
@@ -166,7 +166,7 @@ impl<'a> TrainingPlan<'a> {
 }
 
 /// Errors: `Config` if the model takes actions or states that the data set does not have.
-fn check_channels(dataset: &Dataset, spec: &ModelSpec) -> Result<(), TrainError> {
+pub(super) fn check_channels(dataset: &str, spec: &ModelSpec) -> Result<(), TrainError> {
     let (takes, has) = (
         [spec.action_inputs().is_some(), spec.state_inputs().is_some()],
         [!spec.actions.is_empty(), !spec.states.is_empty()],
@@ -182,9 +182,8 @@ fn check_channels(dataset: &Dataset, spec: &ModelSpec) -> Result<(), TrainError>
         [false, false] => "none",
     };
     Err(TrainError::Config(format!(
-        "data set \"{}\" has no {missing}, but model.conditioning is {}; set model.conditioning to {fitting}, or use a preset that \
-         fits: recording takes actions only, static-flow neither",
-        dataset.info().name,
+        "data set \"{dataset}\" has no {missing}, but model.conditioning is {}; set model.conditioning to {fitting}, or use a preset or a \
+         model that fits: recording takes actions only, static-flow neither",
         spec.conditioning
     )))
 }

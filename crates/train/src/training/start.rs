@@ -4,12 +4,13 @@ use std::collections::BTreeMap;
 
 use candle_core::{Device, Tensor};
 
-use super::TrainError;
-use super::plan::TrainingPlan;
+use super::plan::check_channels as check_conditioning;
+use super::{TrainConfig, TrainError};
 use foreframe_core::error_text::comma_separated;
-use foreframe_core::nn::{ModelSpec, Parameters};
-use foreframe_core::registry::StoredWeights;
+use foreframe_core::nn::{Architecture, ModelSpec, Parameters};
+use foreframe_core::registry::{Manifest, StoredWeights};
 use foreframe_core::types::Seed;
+use foreframe_data::dataset::DatasetInfo;
 
 /// Prefixes of the names of tensors that a network may have and the one before it not.
 const OPTIONAL_PREFIXES: [&str; 5] = [
@@ -20,12 +21,28 @@ const OPTIONAL_PREFIXES: [&str; 5] = [
     "flow.scene.",
 ];
 
+/// Checks by the descriptions alone whether a training on a data set can start from a model. Errors: `OtherNetwork`, `OtherUnits`;
+/// `Config` if the model takes actions or states that the data set does not have.
+pub fn check_start(config: &TrainConfig, dataset: &DatasetInfo, base: &Manifest) -> Result<(), TrainError> {
+    let mut spec = config.unscaled_spec(dataset);
+    if let (Architecture::Flow(flow), Some(base)) = (&mut spec.architecture, base.spec.flow()) {
+        // The cameras of the episodes are not in the description.
+        flow.camera = flow.camera.or(base.camera);
+    }
+    check_conditioning(&dataset.name, &spec)?;
+    let start = StoredWeights {
+        manifest: base.clone(),
+        parameters: Parameters::initialize(&base.spec, config.seed)?,
+    };
+    parameters(&spec, &start, config.seed).map(drop)
+}
+
 /// The weights of another model. What only this training's network has, of movers, speeds, motion and memory, starts as in a new
 /// network, and what only the other one has of them is left out. If this network sees how fast the camera drives, states and actions may be others
 /// too: the weights of those that both have stay, and those of new ones start at 0.
 /// Errors: `OtherNetwork` if they do not fit this training's network, `OtherUnits`.
-pub(super) fn parameters(plan: &TrainingPlan<'_>, start: &StoredWeights, seed: Seed) -> Result<Parameters, TrainError> {
-    let (from, to) = (&start.manifest.spec, &plan.spec);
+pub(super) fn parameters(to: &ModelSpec, start: &StoredWeights, seed: Seed) -> Result<Parameters, TrainError> {
+    let from = &start.manifest.spec;
     let fits = check_channels(start, to);
     let mut tensors = start.parameters.snapshot()?;
     if to.flow().is_some() && from.flow().is_some() {
@@ -47,7 +64,7 @@ pub(super) fn parameters(plan: &TrainingPlan<'_>, start: &StoredWeights, seed: S
     } else {
         fits?;
     }
-    Parameters::from_tensors(&plan.spec, tensors).map_err(|source| TrainError::OtherNetwork {
+    Parameters::from_tensors(to, tensors).map_err(|source| TrainError::OtherNetwork {
         model: start.manifest.name.clone(),
         source,
     })
