@@ -27,8 +27,8 @@ struct ScriptedExecutor {
 }
 
 impl JobExecutor for ScriptedExecutor {
-    fn check<'a>(&'a self, _: &'a JobSpec) -> BoxFuture<'a, Result<(), JobError>> {
-        Box::pin(async { Ok(()) })
+    fn check<'a>(&'a self, spec: &'a JobSpec) -> BoxFuture<'a, Result<JobSpec, JobError>> {
+        Box::pin(async { Ok(spec.clone()) })
     }
 
     fn execute(&self, _: &JobSpec, report: &JobReporter, cancelled: &AtomicBool) -> Result<JobResult, JobFailure> {

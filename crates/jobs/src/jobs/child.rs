@@ -77,7 +77,7 @@ struct ChildExecutor {
 }
 
 impl JobExecutor for ChildExecutor {
-    fn check<'a>(&'a self, spec: &'a JobSpec) -> BoxFuture<'a, Result<(), JobError>> {
+    fn check<'a>(&'a self, spec: &'a JobSpec) -> BoxFuture<'a, Result<JobSpec, JobError>> {
         self.pipeline.check(spec)
     }
 

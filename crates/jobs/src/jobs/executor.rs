@@ -44,9 +44,9 @@ impl JobResult {
 
 /// Does the work of jobs.
 pub trait JobExecutor: Send + Sync + 'static {
-    /// Checks a job before it is enqueued. Errors: `Invalid`, `NotFound`, `Taken`, and the errors of reading
-    /// data sets and models.
-    fn check<'a>(&'a self, spec: &'a JobSpec) -> BoxFuture<'a, Result<(), JobError>>;
+    /// Checks a job before it is enqueued. Returns it as it is to be enqueued: with the version of the model that all its parts use.
+    /// Errors: `Invalid`, `NotFound`, `Taken`, and the errors of reading data sets and models.
+    fn check<'a>(&'a self, spec: &'a JobSpec) -> BoxFuture<'a, Result<JobSpec, JobError>>;
 
     /// Checks that what an ended job needs is still there, before it is enqueued again. Errors: `Invalid`, `Store`.
     fn check_again<'a>(&'a self, _spec: &'a JobSpec) -> BoxFuture<'a, Result<(), JobError>> {

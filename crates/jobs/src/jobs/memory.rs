@@ -54,9 +54,7 @@ impl JobMemory {
         base: Option<&Manifest>,
         objects: &Objects,
     ) -> Result<TrainingEstimate, JobError> {
-        spec.sweep
-            .check()
-            .map_err(|error| JobError::invalid("sweep", error.to_string()))?;
+        spec.check_sweep()?;
         let mut dataset = datasets::describe(objects, &spec.dataset).await?;
         for name in spec.mixture.keys() {
             dataset.frame_count += datasets::describe(objects, name).await?.frame_count;

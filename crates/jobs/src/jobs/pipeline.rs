@@ -77,7 +77,7 @@ impl Pipeline {
 }
 
 impl JobExecutor for Pipeline {
-    fn check<'a>(&'a self, spec: &'a JobSpec) -> BoxFuture<'a, Result<(), JobError>> {
+    fn check<'a>(&'a self, spec: &'a JobSpec) -> BoxFuture<'a, Result<JobSpec, JobError>> {
         Box::pin(self.check_spec(spec))
     }
 
@@ -107,7 +107,7 @@ impl JobExecutor for Pipeline {
 }
 
 impl Pipeline {
-    async fn check_spec(&self, spec: &JobSpec) -> Result<(), JobError> {
+    async fn check_spec(&self, spec: &JobSpec) -> Result<JobSpec, JobError> {
         let objects = self.store.objects();
         if let JobSpec::Import(spec) = spec
             && let Some(upload) = spec.upload()?
@@ -117,7 +117,7 @@ impl Pipeline {
         let (mut datasets, mut models) = (datasets::names(objects).await?, self.versions.all().await?);
         let is_there = spec.datasets().into_iter().all(|name| datasets.contains(name));
         // What the jobs before it will make; each has a smaller number than the next.
-        let mut after = spec.after();
+        let (mut after, mut made) = (spec.after(), Vec::new());
         while let Some(id) = after {
             let row = self.store.job(id).await?;
             if row.is_none() && spec.after() == Some(id) {
@@ -130,6 +130,7 @@ impl Pipeline {
             datasets.extend(earlier.made_dataset().cloned());
             if let Some(model) = earlier.made_model() {
                 models.entry(model.clone()).or_default();
+                made.push(model.clone());
             }
         }
         let (data_dir, import_dir) = (objects.data_dir().to_owned(), self.resources.import_dir.clone());
@@ -144,14 +145,16 @@ impl Pipeline {
             })
         });
         checked.await.unwrap_or(Err(JobError::Stopping))?;
-        match spec {
-            JobSpec::Train(spec) => self.check_training(spec, is_there).await,
+        let spec = self.with_version_of_parts(spec, &made).await?;
+        match &spec {
+            JobSpec::Train(spec) => self.check_training(spec, is_there).await?,
             // Which models fit is known when its data set is made.
-            _ if !is_there => Ok(()),
-            JobSpec::Adapt(spec) => self.check_adaptation(spec).await,
-            JobSpec::Evaluate(spec) => self.check_evaluation(spec).await,
-            JobSpec::Collect(_) | JobSpec::Import(_) => Ok(()),
+            _ if !is_there => {}
+            JobSpec::Adapt(spec) => self.check_adaptation(spec).await?,
+            JobSpec::Evaluate(spec) => self.check_evaluation(spec).await?,
+            JobSpec::Collect(_) | JobSpec::Import(_) => {}
         }
+        Ok(spec)
     }
 
     /// Errors: `Invalid` if an import's uploaded file is gone.
@@ -165,11 +168,7 @@ impl Pipeline {
 
     /// Errors: `Invalid` if a model that is there cannot run on the data set.
     async fn check_evaluation(&self, spec: &EvaluateSpec) -> Result<(), JobError> {
-        let info = DatasetInfo {
-            // The caller knows it by this name.
-            name: spec.dataset.to_string(),
-            ..datasets::describe(self.store.objects(), &spec.dataset).await?
-        };
+        let info = self.described(&spec.dataset).await?;
         let fits = async |name: &ModelName, version: Option<u32>| {
             // What cannot be read says so when the job runs.
             let Ok(manifest) = self.versions.manifest(name, version).await else {

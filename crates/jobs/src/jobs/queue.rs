@@ -60,16 +60,16 @@ impl Jobs {
                 return same(&row, &spec);
             }
         }
-        shared.execute.check(&spec).await?;
+        let checked = shared.execute.check(&spec).await?;
         let new = NewJob {
-            kind: spec.kind().to_owned(),
-            exclusive_output: spec.made_dataset().map(|name| format!("data set {name}")),
-            spec: json(&spec)?,
+            kind: checked.kind().to_owned(),
+            exclusive_output: checked.made_dataset().map(|name| format!("data set {name}")),
+            spec: json(&checked)?,
             progress: json(&StoredProgress::default())?,
             idempotency_key: key,
             submitter: submitter.to_owned(),
-            after: spec.after(),
-            parts: spec.parts().iter().map(json).collect::<Result<_, _>>()?,
+            after: checked.after(),
+            parts: checked.parts().iter().map(json).collect::<Result<_, _>>()?,
         };
         let now_s = shared.store.now_s().await?;
         match shared.store.enqueue(new, shared.limits.queued as i64, now_s).await? {

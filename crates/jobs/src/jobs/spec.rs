@@ -1,30 +1,28 @@
 //! The specification of a job, checked when it is submitted, so that mistakes are reported at once.
 
 mod adapt;
+mod collect;
 mod evaluate;
 mod import;
 pub(super) mod train;
 
 use std::collections::BTreeMap;
-use std::ops::{Range, RangeInclusive};
+use std::fmt;
+use std::ops::RangeInclusive;
 use std::path::Path;
-use std::str::FromStr;
 
-use serde::de::{Error as _, IntoDeserializer as _};
+use serde::de::{DeserializeOwned, Error as _, MapAccess, Visitor};
 use serde::{Deserialize, Deserializer, Serialize};
+use serde_json::{Map, Value};
 
 pub use self::adapt::AdaptSpec;
+pub use self::collect::{CollectSpec, MAX_TRIALS};
 pub use self::evaluate::EvaluateSpec;
 pub use self::import::ImportSpec;
 pub use self::train::TrainSpec;
 use super::JobError;
 use crate::store::JobId;
-use foreframe_core::types::{DatasetName, ModelName, Seed, ValueError};
-use foreframe_data::dataset::{self, CollectConfig, CollectionStatus, DEFAULT_TRIALS_PER_SHARD, DatasetError};
-use foreframe_sim::{RoomSet, Scenario, SimError};
-
-/// The maximum number of trials of one collection.
-pub const MAX_TRIALS: u64 = 1_000_000;
+use foreframe_core::types::{DatasetName, ModelName};
 
 /// The maximum number of parts of one job.
 pub const MAX_PARTS: usize = 64;
@@ -35,7 +33,7 @@ pub const MAX_WINDOWS: usize = 100_000;
 pub const MAX_RESAMPLES: usize = 10_000;
 
 /// What a job does.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, utoipa::ToSchema)]
 #[serde(tag = "kind", rename_all = "snake_case")]
 pub enum JobSpec {
     /// Collect a data set from the simulator.
@@ -50,43 +48,50 @@ pub enum JobSpec {
     Evaluate(EvaluateSpec),
 }
 
-/// A collection: writes the data set `name`. A cancelled collection continues where it stopped when it is resumed, or when
-/// the same collection is submitted again.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
-#[serde(deny_unknown_fields)]
-pub struct CollectSpec {
-    /// The data set's name: a to z, 0 to 9 and `-`, at most 64 characters.
-    #[serde(deserialize_with = "name")]
-    #[schema(value_type = String, pattern = "^[a-z0-9][a-z0-9-]{0,63}$")]
-    pub name: DatasetName,
-    /// `static-observer`, `moving-observer`, `crowded` or `crossing`.
-    pub scenario: String,
-    /// Trials, 1 to 1,000,000.
-    #[schema(minimum = 1, maximum = 1_000_000)]
-    pub trials: u64,
-    /// The random seed.
-    #[serde(default = "default_seed")]
-    #[schema(default = 1)]
-    pub seed: u64,
-    /// The set from which each trial draws a room, a camera and robots of its own. Absent: all trials are in the same room.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub rooms: Option<RoomSet>,
-    /// Whether the states hold the true pose instead of the odometry's.
-    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
-    pub true_pose: bool,
-    /// In how many parts workers may collect it, 1 to 64: each takes its share of the trials, in shards of 50. The data set has
-    /// the same bytes however many there are.
-    #[serde(default = "default_parts", skip_serializing_if = "is_one")]
-    #[schema(minimum = 1, maximum = 64, default = 1)]
-    pub parts: usize,
-    /// Which of the parts this job collects, from 0. Only jobs that are parts have it.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    #[schema(read_only)]
-    pub part: Option<usize>,
+/// Errors name the path of the field that is wrong. Those of serde for an enum with a tag do not.
+impl<'de> Deserialize<'de> for JobSpec {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        deserializer.deserialize_map(JobVisitor)
+    }
 }
 
-fn default_seed() -> u64 {
-    1
+struct JobVisitor;
+
+impl<'de> Visitor<'de> for JobVisitor {
+    type Value = JobSpec;
+
+    fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("a job")
+    }
+
+    fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<JobSpec, A::Error> {
+        let mut fields = Map::new();
+        while let Some((field, value)) = map.next_entry::<String, Value>()? {
+            if fields.contains_key(&field) {
+                return Err(A::Error::custom(format!("duplicate field `{field}`")));
+            }
+            fields.insert(field, value);
+        }
+        let kind = fields.remove("kind").ok_or_else(|| A::Error::missing_field("kind"))?;
+        let fields = Value::Object(fields);
+        let spec = match kind.as_str() {
+            Some("collect") => of_fields(fields).map(JobSpec::Collect),
+            Some("import") => of_fields(fields).map(JobSpec::Import),
+            Some("train") => of_fields(fields).map(JobSpec::Train),
+            Some("adapt") => of_fields(fields).map(JobSpec::Adapt),
+            Some("evaluate") => of_fields(fields).map(JobSpec::Evaluate),
+            _ => {
+                let known = JobSpec::KINDS.join(", ");
+                Err(format!("kind: there is no kind {kind}; there are: {known}"))
+            }
+        };
+        spec.map_err(A::Error::custom)
+    }
+}
+
+/// Errors: a sentence that starts with the path of the field.
+fn of_fields<T: DeserializeOwned>(fields: Value) -> Result<T, String> {
+    serde_path_to_error::deserialize(fields).map_err(|error| error.to_string())
 }
 
 fn default_parts() -> usize {
@@ -182,30 +187,42 @@ impl JobSpec {
         }
     }
 
-    /// The version of `from`, the model whose weights it starts from, where it names one.
-    pub(super) fn starting_version(&self) -> Option<u32> {
+    /// The model that it starts from, or evaluates.
+    pub(super) fn used_model(&self) -> Option<&ModelName> {
         match self {
-            Self::Train(spec) => spec.from_version,
-            Self::Adapt(spec) => spec.from_version,
-            Self::Collect(_) | Self::Import(_) | Self::Evaluate(_) => None,
+            Self::Train(spec) => spec.from.as_ref(),
+            Self::Adapt(spec) => Some(&spec.from),
+            Self::Evaluate(spec) => Some(&spec.model),
+            Self::Collect(_) | Self::Import(_) => None,
         }
     }
 
-    /// The same work from this version of `from`. It stays as it is if it starts from no model.
-    pub(super) fn with_starting_version(&self, version: Option<u32>) -> Self {
+    /// The version of that model, where it names one.
+    pub(super) fn used_version(&self) -> Option<u32> {
+        match self {
+            Self::Train(spec) => spec.from_version,
+            Self::Adapt(spec) => spec.from_version,
+            Self::Evaluate(spec) => spec.version,
+            Self::Collect(_) | Self::Import(_) => None,
+        }
+    }
+
+    /// The same work with this version of that model. It stays as it is if it uses none.
+    pub(super) fn with_used_version(&self, version: Option<u32>) -> Self {
         let mut spec = self.clone();
         match &mut spec {
             Self::Train(spec) if spec.from.is_some() => spec.from_version = version,
             Self::Adapt(spec) => spec.from_version = version,
-            Self::Train(_) | Self::Collect(_) | Self::Import(_) | Self::Evaluate(_) => {}
+            Self::Evaluate(spec) => spec.version = version,
+            Self::Train(_) | Self::Collect(_) | Self::Import(_) => {}
         }
         spec
     }
 
     /// Whether this can be the specification of a job that was submitted as `submitted`. A job that has started names the
-    /// version that it starts from, so a request without one also matches a job that was submitted with one.
+    /// version that it uses, so a request without one also matches a job that was submitted with one.
     pub(super) fn matches_submitted(&self, submitted: &Self) -> bool {
-        *self == submitted.with_starting_version(submitted.starting_version().or(self.starting_version()))
+        *self == submitted.with_used_version(submitted.used_version().or(self.used_version()))
     }
 
     /// Checks everything that can be checked before the work starts. Errors: `Invalid` and `NotFound`, which name the field;
@@ -219,114 +236,6 @@ impl JobSpec {
             Self::Evaluate(spec) => spec.check(available),
         }
     }
-}
-
-impl CollectSpec {
-    fn check(&self, available: AvailableInputs<'_>) -> Result<(), JobError> {
-        if !(1..=MAX_TRIALS).contains(&self.trials) {
-            let reason = format!(
-                "{} is out of range; 1 to {MAX_TRIALS} trials can be collected",
-                self.trials
-            );
-            return Err(JobError::invalid("trials", reason));
-        }
-        check_parts(self.parts, self.part)?;
-        let config = self.config(&available.data_dir.join("datasets"))?;
-        let is_there = available.datasets.contains(&self.name);
-        // With a shared object store, a data set that is complete only here was deleted elsewhere or not yet pushed.
-        if !is_there && dataset::is_finished(&config.out) {
-            return Ok(());
-        }
-        match CollectionStatus::of(&config) {
-            Ok(CollectionStatus::New | CollectionStatus::Unfinished { .. }) if !is_there => Ok(()),
-            Ok(_) => Err(JobError::taken(&self.name, "exists; choose another name")),
-            Err(DatasetError::OutExists { .. }) => Err(JobError::taken(
-                &self.name,
-                "cannot be written because other files are in its directory; move them, or choose another name",
-            )),
-            Err(DatasetError::OtherArguments { differences, .. }) => {
-                let why = format!(
-                    "was started with other arguments ({differences}); use those to continue it, or choose another name"
-                );
-                Err(JobError::taken(&self.name, why))
-            }
-            Err(error) => Err(error.into()),
-        }
-    }
-
-    /// The number of its shards.
-    fn shard_count(&self) -> usize {
-        let shards = self.trials.div_ceil(DEFAULT_TRIALS_PER_SHARD);
-        usize::try_from(shards).unwrap_or(usize::MAX)
-    }
-
-    /// The shards of the part with this index: consecutive ones, in equal shares.
-    pub(super) fn shards_of(&self, part: usize) -> Range<usize> {
-        let (shards, parts) = (self.shard_count(), self.parts.max(1));
-        let start = |part: usize| shards * part.min(parts) / parts;
-        start(part)..start(part + 1)
-    }
-
-    /// Its parts; none if it is collected as a whole. There are never more parts than shards.
-    fn parts(&self) -> Vec<Self> {
-        let parts = self.parts.min(self.shard_count());
-        if parts < 2 || self.part.is_some() {
-            return Vec::new();
-        }
-        let part = |part| Self {
-            parts,
-            part: Some(part),
-            ..self.clone()
-        };
-        (0..parts).map(part).collect()
-    }
-
-    /// The configuration of the collection, into a directory below `datasets`. Errors: `Invalid`, which names the scenarios.
-    pub(super) fn config(&self, datasets: &Path) -> Result<CollectConfig, JobError> {
-        let scenario = self.scenario.parse();
-        let scenario: Scenario =
-            scenario.map_err(|error: SimError| JobError::invalid("scenario", error.to_string()))?;
-        let mut config = CollectConfig::new(scenario, self.trials, Seed(self.seed), &datasets.join(&self.name));
-        config.world.rooms = self.rooms;
-        config.world.true_pose = self.true_pose;
-        Ok(config)
-    }
-}
-
-/// A name in a field of a job. The error starts with the field, as those of [`JobError`] do.
-fn named<'de, D: Deserializer<'de>, N: FromStr<Err = ValueError>>(field: &str, deserializer: D) -> Result<N, D::Error> {
-    let text = String::deserialize(deserializer)?;
-    text.parse()
-        .map_err(|error| D::Error::custom(format!("{field}: {error}")))
-}
-
-fn name<'de, D: Deserializer<'de>, N: FromStr<Err = ValueError>>(deserializer: D) -> Result<N, D::Error> {
-    named("name", deserializer)
-}
-
-fn dataset<'de, D: Deserializer<'de>>(deserializer: D) -> Result<DatasetName, D::Error> {
-    named("dataset", deserializer)
-}
-
-fn from<'de, D: Deserializer<'de>>(deserializer: D) -> Result<ModelName, D::Error> {
-    named("from", deserializer)
-}
-
-fn optional_from<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<ModelName>, D::Error> {
-    optional("from", deserializer)
-}
-
-fn model<'de, D: Deserializer<'de>>(deserializer: D) -> Result<ModelName, D::Error> {
-    named("model", deserializer)
-}
-
-fn twin<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<ModelName>, D::Error> {
-    optional("twin", deserializer)
-}
-
-fn optional<'de, D: Deserializer<'de>>(field: &str, deserializer: D) -> Result<Option<ModelName>, D::Error> {
-    let text = Option::<String>::deserialize(deserializer)?;
-    text.map(|text| named(field, text.into_deserializer())).transpose()
 }
 
 fn check_dataset(name: &DatasetName, available: &[DatasetName]) -> Result<(), JobError> {
@@ -348,6 +257,27 @@ fn check_known<'a, N: PartialEq + ToString + 'a>(
         name: name.to_string(),
         available: available.map(N::to_string).collect(),
     })
+}
+
+/// Errors: `NotFound` if there is no such version of a model; `Invalid` if a job before it may make that version, which has no number
+/// before it is there.
+fn check_version(
+    field: &'static str,
+    version: Option<u32>,
+    after: Option<JobId>,
+    available: Option<&Vec<u32>>,
+) -> Result<(), JobError> {
+    let Some(version) = version else { return Ok(()) };
+    let known = available.into_iter().flatten();
+    match after {
+        Some(after) if known.clone().all(|known| *known != version) => {
+            let reason = format!(
+                "there is no version \"{version}\" yet; if {after} makes it, leave out {field}: then this job uses what {after} made"
+            );
+            Err(JobError::invalid(field, reason))
+        }
+        _ => check_known((field, "version"), &version, known),
+    }
 }
 
 /// Errors: `Invalid` if a job has too many parts, or is submitted as a part.
@@ -394,54 +324,66 @@ mod tests {
     }
 
     #[test]
+    fn a_value_of_the_wrong_type_is_refused_with_its_field() {
+        let refused = |text: &str| serde_json::from_str::<JobSpec>(text).unwrap_err().to_string();
+        for (fields, expected) in [
+            (
+                r#""kind": "train", "name": "a", "dataset": "d", "from_version": "x""#,
+                "from_version: invalid type: string \"x\"",
+            ),
+            (
+                r#""kind": "adapt", "name": "a", "dataset": "d", "steps": "many""#,
+                "steps: invalid type: string \"many\"",
+            ),
+            (
+                r#""kind": "train", "name": "a", "dataset": "d", "mixture": {"b": true}"#,
+                "mixture.b: invalid type: boolean",
+            ),
+            (
+                r#""kind": "train", "name": "a", "dataset": "d", "sweep": {"seed": 1}"#,
+                "sweep.seed: invalid type: integer",
+            ),
+            (
+                r#""kind": "import", "name": "a", "source": "s", "action": ["x", 1]"#,
+                "action[1]: invalid type: integer",
+            ),
+            (
+                r#""kind": "trian", "name": "a""#,
+                "kind: there is no kind \"trian\"; there are: collect, import, train, adapt, evaluate",
+            ),
+            (r#""name": "a""#, "missing field `kind`"),
+            (r#""kind": "train", "name": "a", "name": "b""#, "duplicate field `name`"),
+            (r#""kind": "train", "dataset": "d""#, "missing field `name`"),
+        ] {
+            let error = refused(&format!("{{{fields}}}"));
+            assert!(error.starts_with(expected), "{fields}: {error}");
+        }
+    }
+
+    #[test]
     fn a_job_that_names_its_version_matches_one_that_does_not() {
-        for kind in ["adapt", "train"] {
+        for (kind, version) in [
+            ("adapt", "from_version"),
+            ("train", "from_version"),
+            ("evaluate", "version"),
+        ] {
             let spec = |more: serde_json::Value| -> JobSpec {
-                let mut spec = serde_json::json!({"kind": kind, "name": "a", "dataset": "d", "from": "m"});
+                let mut spec = match kind {
+                    "evaluate" => serde_json::json!({"kind": kind, "model": "m", "dataset": "d"}),
+                    _ => serde_json::json!({"kind": kind, "name": "a", "dataset": "d", "from": "m"}),
+                };
                 spec.as_object_mut().unwrap().extend(more.as_object().unwrap().clone());
                 serde_json::from_value(spec).unwrap()
             };
             let [any, first, second] = [
                 serde_json::json!({}),
-                serde_json::json!({"from_version": 1}),
-                serde_json::json!({"from_version": 2}),
+                serde_json::json!({version: 1}),
+                serde_json::json!({version: 2}),
             ]
             .map(spec);
             assert!(first.matches_submitted(&any) && first.matches_submitted(&first));
             assert!(!first.matches_submitted(&second));
             assert!(!first.matches_submitted(&spec(serde_json::json!({"after": "job-1"}))));
         }
-    }
-
-    #[test]
-    fn the_parts_of_a_collection_are_all_its_shards() {
-        let spec = |trials: u64, parts: usize| -> CollectSpec {
-            let spec = serde_json::json!({"name": "a", "scenario": "crowded", "trials": trials, "parts": parts});
-            serde_json::from_value(spec).unwrap()
-        };
-        for (trials, parts) in [(501, 3), (501, 11), (501, 64), (1_000_000, 64)] {
-            let made = spec(trials, parts).parts();
-            let shards: Vec<usize> = made
-                .iter()
-                .flat_map(|made| made.shards_of(made.part.unwrap()))
-                .collect();
-            assert_eq!(shards, (0..trials.div_ceil(50) as usize).collect::<Vec<_>>());
-            assert!(made.len() <= parts && made.iter().all(|made| !made.shards_of(made.part.unwrap()).is_empty()));
-        }
-        assert_eq!(spec(50, 8).parts(), []);
-        assert_eq!(spec(500, 1).parts(), []);
-    }
-
-    #[test]
-    fn a_collection_in_rooms_takes_a_known_set() {
-        let spec = |set: &str| serde_json::json!({"name": "a", "scenario": "crowded", "trials": 1, "rooms": set, "true_pose": true});
-        let collect: CollectSpec = serde_json::from_value(spec("new-cameras")).unwrap();
-        let world = collect.config(Path::new("datasets")).unwrap().world;
-        assert_eq!((world.rooms, world.true_pose), (Some(RoomSet::NewCameras), true));
-        assert_eq!(serde_json::to_value(&collect).unwrap()["rooms"], "new-cameras");
-        let error = serde_json::from_value::<CollectSpec>(spec("old"))
-            .unwrap_err()
-            .to_string();
-        assert!(error.contains("varied"), "{error}");
     }
 }

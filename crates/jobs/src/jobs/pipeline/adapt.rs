@@ -6,13 +6,13 @@ use serde_json::json;
 
 use super::super::executor::{JobFailure, JobResult};
 use super::super::report::JobReporter;
-use super::super::{AdaptSpec, JobError, JobSpec, datasets};
+use super::super::{AdaptSpec, JobError, JobSpec};
+use super::base::check_start;
 use super::train::TrainingWork;
 use super::{Pipeline, failed};
 use foreframe_core::error_kind::{ErrorKind, HasErrorKind as _};
 use foreframe_core::error_text;
 use foreframe_core::registry;
-use foreframe_data::dataset::DatasetInfo;
 use foreframe_train::adaptation::{AdaptError, Adaptation};
 
 impl Pipeline {
@@ -26,19 +26,19 @@ impl Pipeline {
         report.progress(0, 0, "reading the data set");
         let retry = self.retry_policy(report, cancelled);
         let dataset = self.dataset(&spec.dataset, self.resources.memory.held_mib(), &retry)?;
+        self.prepare_run(&retry)?;
         let base = self.base(&JobSpec::Adapt(spec.clone()), &spec.from, &retry)?;
-        let version = base.weights.manifest.version;
-        let model = retry.run(async || self.versions.load(&spec.from, version).await)?;
+        let model = retry.repeat(|| registry::load_as(&base.dir, &spec.from))?;
         report.progress(0, 0, "looking at the recording");
         let adaptation = retry.repeat(|| Adaptation::of(&model, dataset.clone(), &settings, cancelled))?;
         if let Some(camera) = &adaptation.camera {
             report.line(format!("camera, {camera}"));
         }
         let work = TrainingWork {
-            spec: base.spec,
+            spec: &base.spec,
             config: &adaptation.config,
             dataset: &adaptation.dataset,
-            start: Some(&base.weights),
+            start: Some(&base),
         };
         let (model_dir, manifest) = self.trained(&work, &retry)?;
         let steps = u64::from(spec.steps);
@@ -72,11 +72,7 @@ impl Pipeline {
             // What cannot be read says so when the job runs.
             Err(_) => return Ok(()),
         };
-        let info = DatasetInfo {
-            // The caller knows it by this name.
-            name: spec.dataset.to_string(),
-            ..datasets::describe(self.store.objects(), &spec.dataset).await?
-        };
+        let info = self.described(&spec.dataset).await?;
         let config = spec.settings()?.training(&base, &info).map_err(|error| {
             let field = match error {
                 AdaptError::NotAdaptable(_) => "from",
@@ -87,6 +83,8 @@ impl Pipeline {
             };
             JobError::invalid(field, error_text::with_causes(&error))
         })?;
-        self.resources.memory.check_training(&config, &info)
+        self.resources.memory.check_training(&config, &info)?;
+        let checked = tokio::task::spawn_blocking(move || check_start(&[config], &info, &base));
+        checked.await.unwrap_or(Err(JobError::Stopping))
     }
 }

@@ -1,32 +1,87 @@
-//! The model whose weights a training or an adaptation starts from.
+//! The version of a model that a job uses, and the weights that a training or an adaptation starts from.
+
+use std::path::{Path, PathBuf};
+
+use serde_json::Value;
 
 use super::super::executor::JobFailure;
 use super::super::retry_policy::RetryPolicy;
 use super::super::spec::train::check_from;
-use super::super::{JobError, JobSpec, TrainSpec};
-use super::{Pipeline, failed};
+use super::super::{JobError, JobSpec, TrainSpec, datasets};
+use super::{Pipeline, failed, run_key};
+use crate::store::{JobId, StoreError};
 use crate::versions::{VersionError, Versions};
 use foreframe_core::error_kind::{ErrorKind, HasErrorKind as _};
-use foreframe_core::registry::{self, Manifest, StoredWeights};
-use foreframe_core::types::ModelName;
+use foreframe_core::error_text;
+use foreframe_core::files::write_atomically;
+use foreframe_core::registry::{self, MANIFEST_FILE, Manifest, StoredWeights, WEIGHTS_FILE};
+use foreframe_core::types::{DatasetName, ModelName};
+use foreframe_data::dataset::DatasetInfo;
+use foreframe_train::training::{self, TrainConfig, TrainError};
+
+/// The folder of a run with a copy of the model that it starts from.
+const START_DIR: &str = "start";
 
 /// The model that a job starts from.
 pub(super) struct Base {
     pub(super) weights: StoredWeights,
+    /// Its directory.
+    pub(super) dir: PathBuf,
     /// The job, with the version that it starts from.
     pub(super) spec: JobSpec,
 }
 
 impl Pipeline {
-    /// Loads the model `from`. Without a version, it is the one that the job `after` made, else the active one. The version is also
-    /// written to the job, so that a later attempt starts from the same one. Errors: `Cancelled` if the lease is lost.
+    /// Loads the model `from`. If its version was deleted since the job's last checkpoint, it is the copy in the job's run.
+    /// Errors: `Cancelled` if the lease is lost.
     pub(super) fn base(&self, spec: &JobSpec, from: &ModelName, retry: &RetryPolicy<'_>) -> Result<Base, JobFailure> {
-        let version = match (spec.starting_version(), spec.after()) {
-            (None, Some(after)) => retry.run(async || self.made_version(after, from).await)?,
+        let version = self.used_version(spec, from, retry)?;
+        let kept = self.kept_start(retry);
+        let dir = retry.run(async || match self.versions.directory(from, version).await {
+            Err(VersionError::Unknown { .. }) if kept.join(MANIFEST_FILE).is_file() => Ok(kept.clone()),
+            found => found,
+        })?;
+        let weights = retry.repeat(|| load_base(&dir, from, version))?;
+        let spec = self.with_version_written(spec, version, retry)?;
+        Ok(Base { weights, dir, spec })
+    }
+
+    /// The version of a model that a job uses: the one that it names, else the one that the job before it made, else the active one.
+    pub(super) fn used_version(
+        &self,
+        spec: &JobSpec,
+        model: &ModelName,
+        retry: &RetryPolicy<'_>,
+    ) -> Result<u32, JobFailure> {
+        let version = match (spec.used_version(), spec.after()) {
+            (None, Some(after)) => retry.run(async || self.made_version(after, model).await)?,
             (version, _) => version,
         };
-        let weights = retry.run(async || self.load_base(from, version).await)?;
-        let with_version = spec.with_starting_version(Some(weights.manifest.version));
+        match version {
+            Some(version) => Ok(version),
+            None => Ok(retry
+                .run(async || self.versions.active(model).await)?
+                .unwrap_or_default()),
+        }
+    }
+
+    /// The version of a model that a job made, if it made one.
+    async fn made_version(&self, job: JobId, model: &ModelName) -> Result<Option<u32>, StoreError> {
+        let row = self.store.job(job).await?;
+        let outcome: Option<Value> = row.and_then(|row| serde_json::from_str(&row.outcome?).ok());
+        let made = outcome.filter(|outcome| outcome["model"] == model.as_str());
+        Ok(made.and_then(|made| u32::try_from(made["version"].as_u64()?).ok()))
+    }
+
+    /// Writes the version that a job uses to the job, so that a later attempt uses the same one. Errors: `Cancelled` if the lease is
+    /// lost.
+    pub(super) fn with_version_written(
+        &self,
+        spec: &JobSpec,
+        version: u32,
+        retry: &RetryPolicy<'_>,
+    ) -> Result<JobSpec, JobFailure> {
+        let with_version = spec.with_used_version(Some(version));
         if with_version != *spec {
             let text = serde_json::to_string(&with_version).map_err(|error| failed(&error))?;
             let is_written = retry.run(async || self.store.set_spec(retry.report.lease(), &text).await)?;
@@ -34,28 +89,39 @@ impl Pipeline {
                 return Err(JobFailure::Cancelled);
             }
         }
-        Ok(Base {
-            weights,
-            spec: with_version,
-        })
+        Ok(with_version)
     }
 
-    async fn load_base(&self, name: &ModelName, version: Option<u32>) -> Result<StoredWeights, VersionError> {
-        let version = match version {
-            Some(version) => version,
-            None => self.versions.active(name).await?.unwrap_or_default(),
-        };
-        let mut weights = registry::load_weights(&self.versions.directory(name, version).await?)?;
-        let found = weights.manifest.version;
-        if found != version {
-            return Err(VersionError::Refused {
-                model: name.clone(),
-                version,
-                reason: format!("its manifest is of version {found}"),
-            });
+    /// A job as it is to be enqueued: all its parts use the version that is active now. It stays as it is without parts, and if a job
+    /// before it makes the model (`made`).
+    pub(super) async fn with_version_of_parts(&self, spec: &JobSpec, made: &[ModelName]) -> Result<JobSpec, JobError> {
+        match (spec.used_model(), spec.used_version()) {
+            (Some(model), None) if !made.contains(model) && !spec.parts().is_empty() => {
+                Ok(spec.with_used_version(self.versions.active(model).await?))
+            }
+            _ => Ok(spec.clone()),
         }
-        weights.manifest.name.clone_from(name);
-        Ok(weights)
+    }
+
+    /// Keeps a copy of the model that a job starts from with the job's checkpoint, unless it was shipped and cannot be deleted.
+    pub(super) fn keep_start(&self, base: &Base, retry: &RetryPolicy<'_>) -> Result<(), StoreError> {
+        let (kept, manifest) = (self.kept_start(retry), &base.weights.manifest);
+        let is_shipped = self.versions.shipped(&manifest.name) == Some(manifest.version);
+        if is_shipped || kept.join(MANIFEST_FILE).is_file() {
+            return Ok(());
+        }
+        std::fs::create_dir_all(&kept).map_err(StoreError::io("make", &kept))?;
+        for file in [WEIGHTS_FILE, MANIFEST_FILE] {
+            let [from, to] = [&base.dir, &kept].map(|dir| dir.join(file));
+            let bytes = std::fs::read(&from).map_err(StoreError::io("read", &from))?;
+            write_atomically(&to, &bytes).map_err(StoreError::io("write", &to))?;
+        }
+        Ok(())
+    }
+
+    fn kept_start(&self, retry: &RetryPolicy<'_>) -> PathBuf {
+        let run = run_key(retry.report.id());
+        self.store.objects().data_dir().join(run).join(START_DIR)
     }
 
     /// Errors: `Invalid` if settings of a training are wrong, or it certainly needs too much memory.
@@ -70,22 +136,65 @@ impl Pipeline {
             // What cannot be read says so when the job runs.
             Err(_) => return Ok(()),
         };
-        spec.check_settings(base.as_ref())?;
+        let configs = spec.configs(base.as_ref())?;
         if !is_dataset_there {
             return Ok(());
         }
-        self.resources
-            .memory
-            .check(spec, base.as_ref(), self.store.objects())
-            .await
+        let memory = self.resources.memory;
+        memory.check(spec, base.as_ref(), self.store.objects()).await?;
+        let Some(base) = base else { return Ok(()) };
+        let info = self.described(&spec.dataset).await?;
+        // Computes with as many weights as the model has.
+        let checked = tokio::task::spawn_blocking(move || check_start(&configs, &info, &base));
+        checked.await.unwrap_or(Err(JobError::Stopping))
     }
+
+    /// Describes a data set, by the name that the caller knows.
+    pub(super) async fn described(&self, name: &DatasetName) -> Result<DatasetInfo, JobError> {
+        Ok(DatasetInfo {
+            name: name.to_string(),
+            ..datasets::describe(self.store.objects(), name).await?
+        })
+    }
+}
+
+fn load_base(dir: &Path, name: &ModelName, version: u32) -> Result<StoredWeights, VersionError> {
+    let mut weights = registry::load_weights(dir)?;
+    let found = weights.manifest.version;
+    if found != version {
+        return Err(VersionError::Refused {
+            model: name.clone(),
+            version,
+            reason: format!("its manifest is of version {found}"),
+        });
+    }
+    weights.manifest.name.clone_from(name);
+    Ok(weights)
+}
+
+/// Errors: `Invalid` if trainings on a data set cannot start from a model.
+pub(super) fn check_start(configs: &[TrainConfig], info: &DatasetInfo, base: &Manifest) -> Result<(), JobError> {
+    for (at, config) in configs.iter().enumerate() {
+        // Most trainings of a sweep have the same network.
+        if configs[..at].iter().any(|earlier| earlier.model == config.model) {
+            continue;
+        }
+        training::check_start(config, info, base).map_err(|error| {
+            let field = match error {
+                TrainError::Config(_) => "dataset",
+                _ => "from",
+            };
+            JobError::invalid(field, error_text::with_causes(&error))
+        })?;
+    }
+    Ok(())
 }
 
 /// The description of the model that a training starts from; `None` for new weights. Errors: `NotFound` and `Invalid`, which name the
 /// field; those of a store that is away.
 pub async fn base_manifest(spec: &TrainSpec, versions: &Versions) -> Result<Option<Manifest>, JobError> {
     let Some(from) = &spec.from else { return Ok(None) };
-    check_from(from, spec.from_version, &versions.all().await?)?;
+    check_from(from, spec.from_version, spec.after, &versions.all().await?)?;
     match versions.manifest(from, spec.from_version).await {
         Ok(manifest) => Ok(Some(manifest)),
         Err(error) if error.kind() == ErrorKind::Away => Err(error.into()),

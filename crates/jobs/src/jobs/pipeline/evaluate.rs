@@ -4,7 +4,7 @@
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
-use serde_json::{Value, json};
+use serde_json::json;
 
 use super::super::executor::{JobFailure, JobResult};
 use super::super::report::JobReporter;
@@ -12,11 +12,9 @@ use super::super::retry_policy::RetryPolicy;
 use super::super::{EvaluateSpec, JobSpec};
 use super::parts::LAST_FILE;
 use super::{Pipeline, failed, report_key, request_line, run_key};
-use crate::store::{JobId, ModelMetrics, StoreError};
-use crate::versions::VersionError;
+use crate::store::ModelMetrics;
 use foreframe_core::files::remove_dir;
-use foreframe_core::registry::Model;
-use foreframe_core::types::{ModelName, Seed};
+use foreframe_core::types::Seed;
 use foreframe_train::evaluation::figures::Figure;
 use foreframe_train::evaluation::{
     self, EvaluateConfig, EvaluationError, EvaluationPart, EvaluationProgress, EvaluationReport,
@@ -37,13 +35,13 @@ impl Pipeline {
     ) -> Result<JobResult, JobFailure> {
         let retry = self.retry_policy(report, cancelled);
         let parts = self.ended_parts(report, &retry)?;
-        let model = |name: &ModelName, version| retry.run(async || self.model(name, version).await);
-        let version = match (spec.version, spec.after) {
-            (None, Some(after)) => retry.run(async || self.made_version(after, &spec.model).await)?,
-            (version, _) => version,
-        };
-        let loaded = model(&spec.model, version)?;
-        let twin = spec.twin.as_ref().map(|twin| model(twin, None)).transpose()?;
+        let job = JobSpec::Evaluate(spec.clone());
+        let version = self.used_version(&job, &spec.model, &retry)?;
+        let loaded = retry.run(async || self.versions.load(&spec.model, version).await)?;
+        self.with_version_written(&job, version, &retry)?;
+        let twin = spec.twin.as_ref();
+        let twin = twin.map(|twin| retry.run(async || self.versions.load_active(twin).await));
+        let twin = twin.transpose()?;
         report.progress(0, 0, "reading the data set");
         let dataset = self.dataset(&spec.dataset, self.resources.memory.held_mib(), &retry)?;
         let config = EvaluateConfig {
@@ -51,7 +49,7 @@ impl Pipeline {
             bootstrap_samples: spec.resamples,
             seed: Seed(spec.seed),
             twins: twin.iter().collect(),
-            command: request_line(&JobSpec::Evaluate(spec.undivided())),
+            command: request_line(&JobSpec::Evaluate(spec.undivided(version))),
             cancelled: Some(cancelled),
             saved: self.fetch_parts(&parts, LAST_FILE, &retry)?,
             ..EvaluateConfig::default()
@@ -71,7 +69,7 @@ impl Pipeline {
         let figures = evaluation::draw_figures(&loaded, &dataset, &found).map_err(|error| failed(&error))?;
         let files = self.write_report(&mut found, &figures, &retry)?;
         self.delete_parts(&parts, &retry)?;
-        let (version, scores) = (loaded.manifest.version, found.headline());
+        let scores = found.headline();
         // What models are compared by: the score on other data says something about that data.
         let is_own = loaded.manifest.dataset.includes(&dataset.info().content_hash);
         let has_score = loaded.manifest.metrics.get("test").is_some();
@@ -131,21 +129,6 @@ impl Pipeline {
             .collect();
         files.sort();
         Ok(files)
-    }
-
-    /// The version of a model that a job made, if it made one.
-    pub(super) async fn made_version(&self, job: JobId, model: &ModelName) -> Result<Option<u32>, StoreError> {
-        let row = self.store.job(job).await?;
-        let outcome: Option<Value> = row.and_then(|row| serde_json::from_str(&row.outcome?).ok());
-        let made = outcome.filter(|outcome| outcome["model"] == model.as_str());
-        Ok(made.and_then(|made| u32::try_from(made["version"].as_u64()?).ok()))
-    }
-
-    async fn model(&self, name: &ModelName, version: Option<u32>) -> Result<Model, VersionError> {
-        match version {
-            Some(version) => self.versions.load(name, version).await,
-            None => self.versions.load_active(name).await,
-        }
     }
 }
 

@@ -10,10 +10,11 @@ use super::super::executor::{JobFailure, JobResult};
 use super::super::report::JobReporter;
 use super::super::retry_policy::RetryPolicy;
 use super::super::{JobSpec, TrainSpec};
+use super::base::Base;
 use super::training_report::TrainingReporter;
 use super::{Pipeline, failed, request_line, run_key};
 use crate::store::StoreError;
-use foreframe_core::registry::{Manifest, StoredWeights};
+use foreframe_core::registry::Manifest;
 use foreframe_core::types::ModelName;
 use foreframe_data::dataset::Dataset;
 use foreframe_train::evaluation;
@@ -22,10 +23,11 @@ use foreframe_train::training::{self, CHECKPOINT_FILE, TrainConfig, Training, Tr
 /// What is trained, on what.
 pub(super) struct TrainingWork<'a> {
     /// The job.
-    pub(super) spec: JobSpec,
+    pub(super) spec: &'a JobSpec,
     pub(super) config: &'a TrainConfig,
     pub(super) dataset: &'a Dataset,
-    pub(super) start: Option<&'a StoredWeights>,
+    /// The model that it starts from; `None` for new weights.
+    pub(super) start: Option<&'a Base>,
 }
 
 impl TrainingWork<'_> {
@@ -44,6 +46,7 @@ impl Pipeline {
     ) -> Result<JobResult, JobFailure> {
         report.progress(0, 0, "reading the data set");
         let retry = self.retry_policy(report, cancelled);
+        self.prepare_run(&retry)?;
         let job = JobSpec::Train(spec.clone());
         let base = spec
             .from
@@ -64,10 +67,10 @@ impl Pipeline {
         let opened = opened.collect::<Result<_, JobFailure>>()?;
         let dataset = Dataset::join(opened, config.lacking()).map_err(|error| failed(&error))?;
         let work = TrainingWork {
-            spec: base.as_ref().map_or(job, |base| base.spec.clone()),
+            spec: base.as_ref().map_or(&job, |base| &base.spec),
             config: &config,
             dataset: &dataset,
-            start: base.as_ref().map(|base| &base.weights),
+            start: base.as_ref(),
         };
         let (model_dir, manifest) = self.trained(&work, &retry)?;
         let steps = work.steps().iter().sum::<usize>() as u64;
@@ -83,13 +86,12 @@ impl Pipeline {
     ) -> Result<(PathBuf, Box<Manifest>), JobFailure> {
         let (report, cancelled) = (retry.report, retry.cancelled);
         let run = run_key(report.id());
-        retry.run(async || self.prepare_run(&run, report).await)?;
         let training = Training {
             config: work.config,
             dataset: work.dataset,
             run_dir: &self.store.objects().data_dir().join(&run),
-            command: &request_line(&work.spec),
-            start: work.start,
+            command: &request_line(work.spec),
+            start: work.start.map(|base| &base.weights),
         };
         let mut reporter = TrainingReporter {
             report,
@@ -100,7 +102,7 @@ impl Pipeline {
         let mut observer = |event: TrainingEvent| {
             reporter.on_event(event);
             if matches!(event, TrainingEvent::Checkpointed { .. }) {
-                let pushed = self.runtime.block_on(self.store.objects().push(&run, CHECKPOINT_FILE));
+                let pushed = self.runtime.block_on(self.push_checkpoint(work.start, retry));
                 sync.record(pushed).into_iter().for_each(|line| report.line(line));
             }
         };
@@ -117,12 +119,24 @@ impl Pipeline {
     }
 
     /// Prepares the run's directory: empty at the first attempt, else with the latest checkpoint.
-    async fn prepare_run(&self, run: &str, report: &JobReporter) -> Result<(), StoreError> {
-        let objects = self.store.objects();
-        if report.lease().token == 1 {
-            return objects.delete(run).await;
+    pub(super) fn prepare_run(&self, retry: &RetryPolicy<'_>) -> Result<(), JobFailure> {
+        let (objects, run) = (self.store.objects(), run_key(retry.report.id()));
+        let is_first = retry.report.lease().token == 1;
+        retry.run(async || {
+            if is_first {
+                return objects.delete(&run).await;
+            }
+            checkpoints::fetch_latest(objects, &run).await
+        })
+    }
+
+    /// Copies a checkpoint to the object store, if there is a shared one, after what a later attempt needs besides it.
+    async fn push_checkpoint(&self, start: Option<&Base>, retry: &RetryPolicy<'_>) -> Result<(), StoreError> {
+        if let Some(start) = start {
+            self.keep_start(start, retry)?;
         }
-        checkpoints::fetch_latest(objects, run).await
+        let run = run_key(retry.report.id());
+        self.store.objects().push(&run, CHECKPOINT_FILE).await
     }
 
     /// Publishes a trained model as the next version of that name.

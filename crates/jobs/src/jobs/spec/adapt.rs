@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::train::{check_from, settings_text};
-use super::{AvailableInputs, check_dataset, check_range, dataset, from, name};
+use super::{AvailableInputs, check_dataset, check_range};
 use crate::jobs::JobError;
 use crate::store::JobId;
 use foreframe_core::types::{DatasetName, ModelName};
@@ -20,15 +20,13 @@ const MAX_STEPS: u32 = 100_000;
 #[serde(deny_unknown_fields)]
 pub struct AdaptSpec {
     /// The new model's name: a to z, 0 to 9 and `-`, at most 64 characters.
-    #[serde(deserialize_with = "name")]
     #[schema(value_type = String, pattern = "^[a-z0-9][a-z0-9-]{0,63}$")]
     pub name: ModelName,
     /// Name of a data set in the data directory.
-    #[serde(deserialize_with = "dataset")]
     #[schema(value_type = String)]
     pub dataset: DatasetName,
     /// The model to start from.
-    #[serde(default = "default_base", deserialize_with = "from")]
+    #[serde(default = "default_base")]
     #[schema(value_type = String, default = "rooms")]
     pub from: ModelName,
     /// Its version. If it is absent, the job's first attempt sets it: the version that the job before it made, else the active one.
@@ -71,7 +69,7 @@ impl AdaptSpec {
         check_range("steps", self.steps as usize, 1..=MAX_STEPS as usize)?;
         self.settings()?;
         check_dataset(&self.dataset, available.datasets)?;
-        check_from(&self.from, self.from_version, available.models)
+        check_from(&self.from, self.from_version, self.after, available.models)
     }
 
     /// How the model is adapted. Errors: `Invalid`, which names the setting.

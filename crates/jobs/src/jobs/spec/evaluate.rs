@@ -3,8 +3,8 @@
 use serde::{Deserialize, Serialize};
 
 use super::{
-    AvailableInputs, MAX_RESAMPLES, MAX_WINDOWS, check_dataset, check_known, check_parts, check_range, dataset,
-    default_parts, is_one, model, twin,
+    AvailableInputs, MAX_RESAMPLES, MAX_WINDOWS, check_dataset, check_known, check_parts, check_range, check_version,
+    default_parts, is_one,
 };
 use crate::jobs::JobError;
 use crate::store::JobId;
@@ -16,18 +16,17 @@ use foreframe_train::evaluation::EvaluateConfig;
 #[serde(deny_unknown_fields)]
 pub struct EvaluateSpec {
     /// The model's name.
-    #[serde(deserialize_with = "model")]
     #[schema(value_type = String)]
     pub model: ModelName,
-    /// Its version; by default the one that the job of `after` makes, or the active one.
+    /// Its version. If it is absent, the job's first attempt sets it: the version that the job before it made, else the active one.
+    /// With `parts`, the active one is set when the job is submitted, unless a job before it makes the model.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub version: Option<u32>,
     /// Name of a data set in the data directory.
-    #[serde(deserialize_with = "dataset")]
     #[schema(value_type = String)]
     pub dataset: DatasetName,
     /// A model of the same size without conditioning. The report then shows what the actions are worth.
-    #[serde(default, deserialize_with = "twin", skip_serializing_if = "Option::is_none")]
+    #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schema(value_type = Option<String>)]
     pub twin: Option<ModelName>,
     /// The maximum number of windows of each test set, 1 to 100,000.
@@ -73,10 +72,7 @@ impl EvaluateSpec {
                 check_known((field, "model"), model, available.models.keys())
             })?;
         }
-        let versions = available.models.get(&self.model).into_iter().flatten();
-        if let Some(version) = &self.version {
-            check_known(("version", "version"), version, versions)?;
-        }
+        check_version("version", self.version, self.after, available.models.get(&self.model))?;
         check_parts(self.parts, self.part)?;
         check_range("windows", self.windows, 1..=MAX_WINDOWS)?;
         check_range("resamples", self.resamples, 100..=MAX_RESAMPLES)
@@ -96,9 +92,10 @@ impl EvaluateSpec {
         (0..parts).map(part).collect()
     }
 
-    /// The same evaluation without parts, which gives the same report.
-    pub(in crate::jobs) fn undivided(&self) -> Self {
+    /// The same evaluation of this version without parts, which gives the same report.
+    pub(in crate::jobs) fn undivided(&self, version: u32) -> Self {
         Self {
+            version: Some(version),
             parts: 1,
             part: None,
             ..self.clone()

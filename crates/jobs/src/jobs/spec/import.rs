@@ -7,7 +7,7 @@ use std::path::{Component, Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use super::{AvailableInputs, check_parts, default_parts, is_one, name};
+use super::{AvailableInputs, check_parts, default_parts, is_one};
 use crate::jobs::JobError;
 use crate::jobs::uploads::UploadedFile;
 use foreframe_core::error_text;
@@ -27,7 +27,6 @@ use foreframe_data::dataset::is_finished;
 #[serde(deny_unknown_fields)]
 pub struct ImportSpec {
     /// The data set's name: a to z, 0 to 9 and `-`, at most 64 characters.
-    #[serde(deserialize_with = "name")]
     #[schema(value_type = String, pattern = "^[a-z0-9][a-z0-9-]{0,63}$")]
     pub name: DatasetName,
     /// The recording: the path of a file or folder below the server's `import_dir`, or the `source` of an upload.

@@ -5,7 +5,7 @@ use std::iter;
 
 use serde::{Deserialize, Serialize};
 
-use super::{AvailableInputs, check_dataset, check_known, dataset, name, optional_from};
+use super::{AvailableInputs, check_dataset, check_known, check_version};
 use crate::jobs::JobError;
 use crate::store::JobId;
 use foreframe_core::error_text;
@@ -15,6 +15,10 @@ use foreframe_train::settings::SettingsLayer;
 use foreframe_train::training::sweep::set_nested;
 use foreframe_train::training::{Sweep, TrainConfig, TrainError};
 
+/// The setting that is a field of the job.
+const NAME: &str = "name";
+const NAME_REASON: &str = "the model has the name of the job; leave it out, and give the job another name";
+
 /// A training: publishes the next version of the model `name`. It starts with new weights and the settings of a `preset`, or from
 /// the weights of a model and with its settings (`from`); one of the two must be there. A cancelled training resumes from its
 /// checkpoint. With `sweep`, it has one part for each combination of the values, and each part publishes a version.
@@ -22,7 +26,6 @@ use foreframe_train::training::{Sweep, TrainConfig, TrainError};
 #[serde(deny_unknown_fields)]
 pub struct TrainSpec {
     /// The model's name: a to z, 0 to 9 and `-`, at most 64 characters.
-    #[serde(deserialize_with = "name")]
     #[schema(value_type = String, pattern = "^[a-z0-9][a-z0-9-]{0,63}$")]
     pub name: ModelName,
     /// The preset of its settings.
@@ -31,16 +34,15 @@ pub struct TrainSpec {
     pub preset: Option<String>,
     /// Instead of a preset: the model to start from (fine-tuning). Its settings count but for the pre-training, which is left out. A
     /// few hundred steps are often enough: `{"sequence": {"steps": 300}}`.
-    #[serde(default, skip_serializing_if = "Option::is_none", deserialize_with = "optional_from")]
+    #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schema(value_type = Option<String>)]
     pub from: Option<ModelName>,
     /// Its version. If it is absent, the job's first attempt sets it: the version that the job before it made, else the active one.
-    /// Each training of a sweep sets its own.
+    /// For a sweep, the active one is set when the job is submitted, unless a job before it makes the model.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schema(minimum = 1)]
     pub from_version: Option<u32>,
     /// Name of a data set in the data directory.
-    #[serde(deserialize_with = "dataset")]
     #[schema(value_type = String)]
     pub dataset: DatasetName,
     /// Further data sets to train on, each with a weight above 0: how many windows it gives for one of `dataset`. Frame size,
@@ -76,15 +78,14 @@ fn preset_schema() -> utoipa::openapi::Object {
 impl TrainSpec {
     pub(super) fn check(&self, available: AvailableInputs<'_>) -> Result<(), JobError> {
         let datasets = available.datasets;
-        let sweep = self.sweep.check();
-        sweep.map_err(|error| JobError::invalid("sweep", error.to_string()))?;
+        self.check_sweep()?;
         match &self.from {
             // Its settings are known when the model is read.
             Some(from) => {
                 self.check_start()?;
-                check_from(from, self.from_version, available.models)?;
+                check_from(from, self.from_version, self.after, available.models)?;
             }
-            None => self.check_settings(None)?,
+            None => drop(self.configs(None)?),
         }
         check_dataset(&self.dataset, datasets)?;
         for (name, weight) in &self.mixture {
@@ -121,10 +122,20 @@ impl TrainSpec {
         }
     }
 
-    /// Checks the settings of all its trainings. Errors: those of [`Self::config`].
-    pub(in crate::jobs) fn check_settings(&self, base: Option<&Manifest>) -> Result<(), JobError> {
-        self.config(base)?;
-        self.parts().iter().try_for_each(|part| part.config(base).map(drop))
+    /// Errors: `Invalid` if the sweep is too large, or sweeps what is no setting of a job.
+    pub(in crate::jobs) fn check_sweep(&self) -> Result<(), JobError> {
+        let checked = self.sweep.check();
+        checked.map_err(|error| JobError::invalid("sweep", error.to_string()))?;
+        match self.sweep.points().first() {
+            Some(point) if point.contains_key(NAME) => Err(JobError::invalid("sweep.name", NAME_REASON)),
+            _ => Ok(()),
+        }
+    }
+
+    /// The settings of all its trainings, before them those that they have in common. Errors: those of [`Self::config`].
+    pub(in crate::jobs) fn configs(&self, base: Option<&Manifest>) -> Result<Vec<TrainConfig>, JobError> {
+        let parts = self.parts();
+        iter::once(self).chain(&parts).map(|spec| spec.config(base)).collect()
     }
 
     /// All data sets with their weights.
@@ -174,22 +185,22 @@ impl TrainSpec {
     }
 }
 
-/// Errors: `NotFound` if there is no model `from`, or no such version of it.
+/// Errors: `NotFound` if there is no model `from`; those of [`check_version`].
 pub(in crate::jobs) fn check_from(
     from: &ModelName,
     version: Option<u32>,
+    after: Option<JobId>,
     models: &BTreeMap<ModelName, Vec<u32>>,
 ) -> Result<(), JobError> {
     check_known(("from", "model"), from, models.keys())?;
-    let versions = models.get(from).into_iter().flatten();
-    match &version {
-        Some(version) => check_known(("from_version", "version"), version, versions),
-        None => Ok(()),
-    }
+    check_version("from_version", version, after, models.get(from))
 }
 
 /// Settings of a job as TOML. Errors: `Invalid`.
 pub(super) fn settings_text(settings: &serde_json::Map<String, serde_json::Value>) -> Result<String, JobError> {
+    if settings.contains_key(NAME) {
+        return Err(JobError::invalid("settings.name", NAME_REASON));
+    }
     toml::to_string(settings).map_err(|error| {
         let reason = format!("{error}; a setting is a number, a string, true or false, not null");
         JobError::invalid("settings", reason)
@@ -240,10 +251,34 @@ mod tests {
         assert!(model.contains("there is no model \"bass\"; there are: base"), "{model}");
         let model = refused(serde_json::json!({"from": "base", "from_version": 2}));
         assert!(model.starts_with("from_version: "), "{model}");
+        let waiting = refused(serde_json::json!({"from": "base", "from_version": 2, "after": "job-7"}));
         assert_eq!(
-            check(&training(&serde_json::json!({"from": "base", "from_version": 1}))),
-            Ok(())
+            waiting,
+            "from_version: there is no version \"2\" yet; if job-7 makes it, leave out from_version: then this job uses what job-7 made"
         );
+        for more in [
+            serde_json::json!({"from": "base", "from_version": 1}),
+            serde_json::json!({"from": "base", "from_version": 1, "after": "job-7"}),
+        ] {
+            assert_eq!(check(&training(&more)), Ok(()));
+        }
+    }
+
+    #[test]
+    fn the_name_is_no_setting() {
+        let refused = |more| check(&training(&more)).unwrap_err();
+        let set = refused(serde_json::json!({"preset": "paper", "settings": {"name": "other"}}));
+        assert!(
+            set.starts_with("settings.name: the model has the name of the job"),
+            "{set}"
+        );
+        let swept = refused(serde_json::json!({"preset": "paper", "sweep": {"name": ["a", "b"]}}));
+        assert!(
+            swept.starts_with("sweep.name: the model has the name of the job"),
+            "{swept}"
+        );
+        let of_group = refused(serde_json::json!({"preset": "paper", "sweep": {"name.x": [1]}}));
+        assert!(of_group.starts_with("settings.name: "), "{of_group}");
     }
 
     #[test]
