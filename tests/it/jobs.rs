@@ -399,7 +399,7 @@ async fn an_invalid_job_is_refused_at_submission() {
         (
             json!({"kind": "dream"}),
             422,
-            "unknown variant `dream`, expected one of `collect`, `import`, `train`, `adapt`, `evaluate`",
+            "kind: there is no kind \"dream\"; there are: collect, import, train, adapt, evaluate",
         ),
     ] {
         let answer = post(&app, JOBS, &body).await.detail(status);
