@@ -11,17 +11,44 @@ use pulp::{Arch, Simd, WithSimd};
 /// `WithSimd`, so a closure that could run twice becomes `Fn` or `FnMut` and is called through a wrapper, which may be left
 /// without the vector instructions. With the bound `FnOnce` there is no wrapper.
 pub fn vectorized<R>(run: impl FnOnce() -> R) -> R {
+    vectorized_by(
+        #[inline(always)]
+        |_| run(),
+    )
+}
+
+/// As [`vectorized`], of a loop that chooses some instructions itself: the closure hears which it is compiled with.
+pub(crate) fn vectorized_by<R>(run: impl FnOnce(Instructions) -> R) -> R {
     Arch::new().dispatch(Loop(run))
+}
+
+/// The vector instructions that a loop is compiled with, which this machine has.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Instructions {
+    lanes: usize,
+}
+
+impl Instructions {
+    /// No more than those that the whole program is compiled with.
+    #[cfg(test)]
+    pub(crate) const PLAIN: Self = Self { lanes: 1 };
+
+    /// Whether they are AVX-512 or later, with its parts for all kinds of numbers.
+    #[inline(always)]
+    pub(crate) fn have_avx512(self) -> bool {
+        cfg!(target_arch = "x86_64") && self.lanes == 16
+    }
 }
 
 struct Loop<F>(F);
 
-impl<R, F: FnOnce() -> R> WithSimd for Loop<F> {
+impl<R, F: FnOnce(Instructions) -> R> WithSimd for Loop<F> {
     type Output = R;
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, _: S) -> R {
-        (self.0)()
+        let lanes = S::F32_LANES;
+        (self.0)(Instructions { lanes })
     }
 }
 

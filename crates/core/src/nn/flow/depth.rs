@@ -4,7 +4,6 @@
 use candle_core::{DType, Device, Tensor};
 use rayon::prelude::*;
 
-use super::blocks::sampled_blocks;
 use super::depth_head::{DepthHead, SeenPlaces};
 use super::depth_views::{DepthViews, FrameLevels};
 use super::memory::{Memory, Recalled, known_poses};
@@ -20,7 +19,6 @@ use crate::nn::geometry::camera::Viewer;
 use crate::nn::ops::compose::{Composition, RoomPlaces};
 use crate::nn::ops::linear::per_place;
 use crate::nn::ops::sampling::sample_features;
-use crate::nn::tensors::with_values;
 
 /// What the network sees of contexts, for all rollouts that follow them.
 pub(super) struct SeenDepths {
@@ -36,8 +34,6 @@ pub(super) struct SeenDepths {
 /// Where the frames after contexts are seen from, and the decoder's state of each.
 struct SeenAhead {
     context_of: Vec<u32>,
-    /// `[M, P, PLACE_VALUES]`.
-    places: Tensor,
     seen: SeenPlaces,
     /// `[M, H/4, W/4, C]`.
     state: Tensor,
@@ -172,14 +168,13 @@ impl FlowNetwork {
             context_of: context_of.clone(),
         };
         let places = reproject(reprojection, &depths.depths, &ahead.motion()?)?;
-        let seen = with_values(&places, |places| SeenPlaces::of(places, size))?;
+        let seen = SeenPlaces::of(places, size)?;
         let warped = sample_features(&depths.coarse, seen.coarse.clone(), &context_of)?;
         let beside = seen.beside_features(&depths.views, &context_of, size)?;
         let state = per_place(&self.mix, &Tensor::cat(&[&warped, &beside], 3)?)?;
         let state = self.refined(state, &ahead.modulation()?)?;
         Ok(SeenAhead {
             context_of,
-            places,
             seen,
             state,
         })
@@ -195,12 +190,11 @@ impl FlowNetwork {
         let shape = (ahead.rows.count(), ahead.steps(), size.pixels());
         let SeenAhead {
             context_of,
-            places,
             seen,
             state,
         } = self.see_ahead(ahead, depths)?;
         let movers = self.movers.as_ref().map(|movers| movers.coming(&state)).transpose()?;
-        let moved = sampled_blocks(&views.frames, &context_of, &seen.room, size)?;
+        let moved = seen.moved_blocks(&views.frames, &context_of, size)?;
         let levels: Vec<[f32; 2]> = context_of
             .iter()
             .map(|&context| views.levels[context as usize])
@@ -224,7 +218,7 @@ impl FlowNetwork {
             frame_of: context_of.clone(),
             room: RoomPlaces::Tracked,
         };
-        let mut frames = composition.compose(&head, &no_content, &places)?;
+        let mut frames = composition.compose(&head, &no_content, &seen.places)?;
         if let (Some(memory), Some(recalled)) = (memory, &recalled) {
             frames = memory.mix(&frames, &fine, recalled)?;
         }

@@ -2,7 +2,7 @@
 
 use candle_core::{Device, Tensor};
 
-use super::blocks::coarse_places;
+use super::blocks::{coarse_places, sampled_blocks};
 use super::depth_views::{DepthViews, KNOWN_VALUES};
 use super::reprojection::PLACE_VALUES;
 use crate::nn::error::NnError;
@@ -13,8 +13,9 @@ use crate::nn::ops::image_geometry::ConvShape;
 use crate::nn::ops::linear::{Linear, per_place};
 use crate::nn::ops::modulation::silu;
 use crate::nn::ops::pixel_shuffle::pixel_shuffle;
-use crate::nn::ops::sampling::{ImageSize, own_places};
+use crate::nn::ops::sampling::{ImageSize, PixelPlaces, own_places};
 use crate::nn::precision::Precision;
+use crate::nn::tensors::with_values;
 
 /// Values beside the moved features from which a step's state is made: place and inverse depth, and whether the last frame
 /// showed it.
@@ -70,27 +71,31 @@ impl DepthHead {
 
 /// Where the items' pixels were seen, without gradients.
 pub(super) struct SeenPlaces {
-    /// Before the camera turned and drove, `[M, P, 2]`.
-    pub(super) room: Vec<f32>,
-    /// The same on the grid of a quarter of the sides.
+    /// As [`reproject`](super::reprojection::reproject) gives them.
+    pub(super) places: Tensor,
+    /// Before the camera turned and drove, on the grid of a quarter of the sides, `[M, H/4, W/4, 2]`.
     pub(super) coarse: Vec<f32>,
-    /// Inverse depth in the new view, `[M, P]`.
-    inverse_depths: Vec<f32>,
 }
 
 impl SeenPlaces {
-    pub(super) fn of(places: &[f32], size: ImageSize) -> Self {
-        let (count, pixels) = (places.len() / PLACE_VALUES, places.chunks_exact(PLACE_VALUES));
-        let (mut room, mut inverse_depths) = (Vec::with_capacity(2 * count), Vec::with_capacity(count));
-        for place in pixels {
-            room.extend_from_slice(&place[2..4]);
-            inverse_depths.push(1.0 / place[4].max(LEAST_DEPTH_M));
-        }
-        Self {
-            room,
-            coarse: coarse_places(places, PLACE_VALUES, 2, size),
-            inverse_depths,
-        }
+    pub(super) fn of(places: Tensor, size: ImageSize) -> Result<Self, NnError> {
+        let each = PLACE_VALUES * size.pixels();
+        let coarse = with_values(&places, |places| {
+            let items = places.chunks_exact(each);
+            items
+                .flat_map(|places| coarse_places(room_of(places, size), size))
+                .collect()
+        })?;
+        Ok(Self { places, coarse })
+    }
+
+    /// The last frames `[contexts, P]` as the items see them, as [`sampled_blocks`] says.
+    pub(super) fn moved_blocks(&self, frames: &[f32], context_of: &[u32], size: ImageSize) -> Result<Tensor, NnError> {
+        let moved = with_values(&self.places, |places| {
+            let items = places.chunks_exact(PLACE_VALUES * size.pixels());
+            sampled_blocks(frames, context_of, items.map(|places| room_of(places, size)), size)
+        })?;
+        Ok(moved?)
     }
 
     /// The other inputs of the step's state, beside the moved features, `[M, H/4, W/4, MIXED_VALUES]`.
@@ -128,25 +133,37 @@ impl SeenPlaces {
         size: ImageSize,
     ) -> Result<Tensor, NnError> {
         let (half, pixels) = (size.shrunk(2), size.pixels());
-        let mut values = Vec::with_capacity(context_of.len() * half.pixels() * FINE_VALUES);
-        for (item, &context) in context_of.iter().enumerate() {
-            let known = &views.known[context as usize * half.pixels() * KNOWN_VALUES..];
-            let mut blocks = known.chunks_exact(KNOWN_VALUES);
-            for row in 0..half.height {
-                for (column, known) in blocks.by_ref().take(half.width).enumerate() {
-                    values.extend_from_slice(known);
+        let mut values = vec![0.0; context_of.len() * half.pixels() * FINE_VALUES];
+        with_values(&self.places, |places| {
+            let items = values
+                .chunks_exact_mut(half.pixels() * FINE_VALUES)
+                .zip(places.chunks_exact(PLACE_VALUES * pixels));
+            for ((values, places), &context) in items.zip(context_of) {
+                let known = &views.known[context as usize * half.pixels() * KNOWN_VALUES..];
+                let (room, depths) = (room_of(places, size), &places[4 * pixels..]);
+                let blocks = values
+                    .chunks_exact_mut(FINE_VALUES)
+                    .zip(known.chunks_exact(KNOWN_VALUES));
+                for (block, (values, known)) in blocks.enumerate() {
                     // The block's upper left pixel.
-                    let pixel = item * pixels + 2 * row * size.width + 2 * column;
-                    values.push(self.inverse_depths[pixel]);
-                    let outside = size.outside([self.room[2 * pixel], self.room[2 * pixel + 1]]);
-                    values.push((outside / OUTSIDE_PX).min(MAX_OUTSIDE));
+                    let pixel = 2 * (block / half.width * size.width + block % half.width);
+                    values[..KNOWN_VALUES].copy_from_slice(known);
+                    values[KNOWN_VALUES] = 1.0 / depths[pixel].max(LEAST_DEPTH_M);
+                    let outside = size.outside(room.at(pixel));
+                    values[KNOWN_VALUES + 1] = (outside / OUTSIDE_PX).min(MAX_OUTSIDE);
                 }
             }
-        }
+        })?;
         Ok(Tensor::from_vec(
             values,
             (context_of.len(), half.height, half.width, ()),
             &Device::Cpu,
         )?)
     }
+}
+
+/// Columns and rows of an item's pixels before the camera turned and drove, from its `[PLACE_VALUES, P]`.
+fn room_of(places: &[f32], size: ImageSize) -> PixelPlaces<'_> {
+    let pixels = size.pixels();
+    PixelPlaces::Axes([2, 3].map(|value| &places[value * pixels..(value + 1) * pixels]))
 }

@@ -13,8 +13,8 @@ use super::blocks::centred;
 use super::encoder_views::EncoderViews;
 use crate::frame::warp::CameraModel;
 use crate::nn::geometry::camera::{Viewer, ViewerRays, rotated};
-use crate::nn::ops::sampling::{ImageSize, OfPlaces, SAMPLED_TOGETHER};
-use crate::vectorized::vectorized;
+use crate::nn::ops::sampling::{ImageSize, OfPlaces, SAMPLED_TOGETHER, SampledImage, read_together, write_together};
+use crate::vectorized::vectorized_by;
 
 /// Distance of everything that the floor does not explain, before anything is learned.
 pub(super) const WALL_M: f32 = 2.2;
@@ -177,20 +177,24 @@ fn moved_back(
     [last, earlier]: [&[f32]; 2],
 ) -> (Vec<f32>, Vec<f32>) {
     let (half, width) = (size.shrunk(2), size.width);
-    let earlier = EarlierView::new(camera.viewer, motion, earlier);
+    let earlier_view = EarlierView::new(camera.viewer, motion);
     let (mut moved, mut shifts) = (last.to_vec(), vec![0.0; half.pixels() * 2]);
-    vectorized(
+    vectorized_by(
         #[inline(always)]
-        || {
+        |instructions| {
+            let earlier = SampledImage {
+                size,
+                pixels: earlier,
+                instructions,
+            };
             for (row, moved) in moved.chunks_exact_mut(width).enumerate() {
-                let pixels = row * width..(row + 1) * width;
-                let (rays, depths) = (&camera.rays[pixels.clone()], &depths[pixels]);
-                let together = rays.chunks(SAMPLED_TOGETHER).zip(depths.chunks(SAMPLED_TOGETHER));
+                let first = (row * width..(row + 1) * width).step_by(SAMPLED_TOGETHER);
                 let blocks = shifts[row / 2 * width..][..width].chunks_mut(SAMPLED_TOGETHER);
-                for (((rays, depths), moved), shifts) in together.zip(moved.chunks_mut(SAMPLED_TOGETHER)).zip(blocks) {
-                    let near = earlier.places(rays, depths, 1.0);
-                    let far = earlier.places(rays, depths, FARTHER);
-                    earlier.put(size, &near, moved);
+                for ((first, moved), shifts) in first.zip(moved.chunks_mut(SAMPLED_TOGETHER)).zip(blocks) {
+                    let (rays, depths) = (camera.together(first), read_together(depths, first));
+                    let near = earlier_view.places(rays, &depths, 1.0);
+                    let far = earlier_view.places(rays, &depths, FARTHER);
+                    put_shown(earlier, &near, moved);
                     add_shifts([&near, &far], shifts);
                 }
             }
@@ -199,18 +203,17 @@ fn moved_back(
     (moved, shifts)
 }
 
-/// An earlier frame, and how the camera has moved since.
-struct EarlierView<'a> {
+/// An earlier frame's camera, and how it has moved since.
+struct EarlierView {
     viewer: Viewer,
     sin: f32,
     cos: f32,
     ahead: f32,
     left: f32,
-    frame: &'a [f32],
 }
 
-impl<'a> EarlierView<'a> {
-    fn new(viewer: Viewer, [yaw, ahead, left]: [f32; 3], frame: &'a [f32]) -> Self {
+impl EarlierView {
+    fn new(viewer: Viewer, [yaw, ahead, left]: [f32; 3]) -> Self {
         let (sin, cos) = (-yaw).sin_cos();
         Self {
             viewer,
@@ -218,34 +221,37 @@ impl<'a> EarlierView<'a> {
             cos,
             ahead,
             left,
-            frame,
         }
     }
 
     /// Where it shows what some neighbouring rays meet at these depths, `farther` times as deep.
     #[inline(always)]
-    fn places(&self, rays: &[[f32; 3]], depths: &[f32], farther: f32) -> [OfPlaces; 2] {
+    fn places(&self, rays: [&OfPlaces; 3], depths: &OfPlaces, farther: f32) -> [OfPlaces; 2] {
         let mut points = [[0.0; SAMPLED_TOGETHER]; 3];
-        for (at, (ray, depth)) in rays.iter().zip(depths).enumerate() {
-            [points[0][at], points[1][at], points[2][at]] = ray.map(|part| farther * depth * part);
-        }
-        let [x, y, z] = &mut points;
-        for ((x, y), z) in x.iter_mut().zip(y).zip(z) {
-            [*x, *y, *z] = rotated([*x - self.ahead, *y - self.left, *z], self.sin, self.cos);
+        for at in 0..SAMPLED_TOGETHER {
+            let depth = farther * depths[at];
+            let point = [
+                depth * rays[0][at] - self.ahead,
+                depth * rays[1][at] - self.left,
+                depth * rays[2][at],
+            ];
+            [points[0][at], points[1][at], points[2][at]] = rotated(point, self.sin, self.cos);
         }
         self.viewer.project_together(&points)
     }
+}
 
-    /// Writes the pixels at those places, if it shows them.
-    #[inline(always)]
-    fn put(&self, size: ImageSize, places: &[OfPlaces; 2], moved: &mut [f32]) {
-        let sampled = size.sample(self.frame, places);
-        for (at, moved) in moved.iter_mut().enumerate() {
-            if size.shows([places[0][at], places[1][at]]) {
-                *moved = sampled[at];
-            }
+/// Writes the pixels at places of a frame, if it shows them.
+#[inline(always)]
+fn put_shown(frame: SampledImage, places: &[OfPlaces; 2], moved: &mut [f32]) {
+    let mut shown = read_together(moved, 0);
+    let sampled = frame.sample(places);
+    for at in 0..SAMPLED_TOGETHER {
+        if frame.size.shows([places[0][at], places[1][at]]) {
+            shown[at] = sampled[at];
         }
     }
+    write_together(&shown, moved, 0);
 }
 
 /// Adds how far some pixels of a row shift from near to far to the shifts of their blocks.

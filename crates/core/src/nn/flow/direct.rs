@@ -12,7 +12,7 @@ use crate::nn::geometry::camera::{CameraPose, Viewer, turning_places};
 use crate::nn::ops::compose::{Composition, RoomPlaces, SCENE_FEATURES};
 use crate::nn::ops::linear::per_place;
 use crate::nn::ops::pixel_shuffle::pixel_unshuffle;
-use crate::nn::ops::sampling::{own_places, sample_features};
+use crate::nn::ops::sampling::{PixelPlaces, own_places, sample_features};
 use crate::nn::tensors::with_values;
 
 /// What the network sees of contexts, for all rollouts that follow them.
@@ -50,7 +50,10 @@ impl FlowNetwork {
         let scene = scene.forward(ahead.rows, &ahead.row_of(), &motion, &poses)?;
         let context_of = ahead.context_of();
         let warped = sample_features(&seen.coarse, geometry.coarse, &context_of)?;
-        let blocks_at = |places: &[f32]| sampled_blocks(&seen.last_frames, &context_of, places, size);
+        let blocks_at = |places: &[f32]| {
+            let items = places.chunks_exact(2 * size.pixels()).map(PixelPlaces::Pairs);
+            sampled_blocks(&seen.last_frames, &context_of, items, size)
+        };
         let moved = match &geometry.room {
             Some(places) => blocks_at(places)?,
             None => with_values(&geometry.turned, blocks_at)??,
@@ -105,7 +108,12 @@ impl FlowNetwork {
             Some(places) => places,
             None => own.broadcast_as((items, size.pixels(), 2))?.contiguous()?,
         };
-        let coarse = with_values(&turned, |places| coarse_places(places, 2, 0, size))?;
+        let coarse = with_values(&turned, |places| {
+            let items = places.chunks_exact(2 * size.pixels());
+            items
+                .flat_map(|places| coarse_places(PixelPlaces::Pairs(places), size))
+                .collect()
+        })?;
         Ok(ItemPlaces {
             turned,
             coarse,

@@ -4,7 +4,7 @@ use super::blocks::{centred, write_blocks};
 use crate::frame::warp::CameraModel;
 use crate::nn::geometry::camera::{CameraPose, Viewer};
 use crate::nn::geometry::state_channels::StateChannels;
-use crate::nn::ops::sampling::own_places;
+use crate::nn::ops::sampling::{PixelPlaces, own_places};
 use crate::nn::spec::ModelSpec;
 
 /// The contexts that are encoded, each once.
@@ -47,14 +47,21 @@ impl EncoderViews<'_> {
         let mut inputs = vec![0.0; self.count() * half.pixels() * channels];
         for (index, inputs) in inputs.chunks_exact_mut(half.pixels() * channels).enumerate() {
             let yaw_rate = StateChannels::of(self.spec).yaw_rate_in(&self.states[index]);
-            write_blocks(&self.last_frames[index * pixels..], size, &own, inputs, 0);
+            write_blocks(
+                &self.last_frames[index * pixels..][..pixels],
+                size,
+                PixelPlaces::Pairs(&own),
+                inputs,
+                0,
+            );
             for back in 1..frames_read {
-                let frame = &self.earlier[(index * (frames_read - 1) + back - 1) * pixels..];
+                let frame = &self.earlier[(index * (frames_read - 1) + back - 1) * pixels..][..pixels];
                 let turned = yaw_rate.zip(camera).map(|(rate, camera)| {
                     let yaw = rate * self.spec.frame_period_s as f32 * back as f32;
                     Viewer::new(camera, size).turned(&[yaw])
                 });
-                write_blocks(frame, size, turned.as_ref().unwrap_or(&own), inputs, 4 * back);
+                let places = PixelPlaces::Pairs(turned.as_ref().unwrap_or(&own));
+                write_blocks(frame, size, places, inputs, 4 * back);
             }
             let seen = &seen[index * half.pixels() * 4..(index + 1) * half.pixels() * 4];
             for (place, (out, seen)) in inputs.chunks_exact_mut(channels).zip(seen.chunks_exact(4)).enumerate() {

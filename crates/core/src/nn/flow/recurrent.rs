@@ -13,7 +13,7 @@ use crate::nn::geometry::camera::CameraPose;
 use crate::nn::ops::compose::{Composition, RoomPlaces, SCENE_FEATURES};
 use crate::nn::ops::linear::per_place;
 use crate::nn::ops::pixel_shuffle::pixel_unshuffle;
-use crate::nn::ops::sampling::{own_places, sample_features};
+use crate::nn::ops::sampling::{PixelPlaces, own_places, sample_features};
 use crate::nn::tensors::with_values;
 
 impl FlowNetwork {
@@ -51,7 +51,8 @@ impl FlowNetwork {
         }
         let mut frames = Vec::with_capacity(steps);
         for step in 0..steps {
-            let moved = sampled_blocks(&last_frames, &each, &own, size)?;
+            let items = own.chunks_exact(2 * size.pixels()).map(PixelPlaces::Pairs);
+            let moved = sampled_blocks(&last_frames, &each, items, size)?;
             let seen = pixel_unshuffle(&moved.narrow(3, 0, BLOCK_PIXELS)?)?;
             let inputs = Tensor::cat(&[&state, &features, &seen], 3)?;
             state = (state + per_place(&self.mix, &inputs)?)?;

@@ -10,8 +10,8 @@ use candle_core::{Result, Shape, Tensor, bail};
 use crate::frame::warp::MIN_DEPTH;
 use crate::nn::fused::{FusedOperation, Operand, apply};
 use crate::nn::geometry::camera::{Viewer, ViewerRays, rotated};
-use crate::nn::ops::sampling::{ImageSize, Neighbourhood, OfPlaces, SAMPLED_TOGETHER};
-use crate::vectorized::vectorized;
+use crate::nn::ops::sampling::{ImageSize, Neighbourhood, OfPlaces, SAMPLED_TOGETHER, SampledImage, write_together};
+use crate::vectorized::{Instructions, vectorized_by};
 
 /// Values of a pixel: its place before the turn, its place before turn and drive (columns and rows), its depth in metres.
 pub(super) const PLACE_VALUES: usize = 5;
@@ -23,7 +23,7 @@ pub(super) const CORRECTION: [f32; 2] = [0.5, 2.0];
 /// Least change of a pixel's depth in the old view with its depth in the new one, in gradients.
 pub(super) const MIN_DEEPENING: f32 = 0.2;
 
-/// The places `[M, P, PLACE_VALUES]` of items that follow contexts with these `depths` `[contexts, P]`, after the camera's
+/// The places `[M, PLACE_VALUES, P]` of items that follow contexts with these `depths` `[contexts, P]`, after the camera's
 /// `motions` `[M, 3]` (yaw, ahead, left). Gradients go to both.
 pub(super) fn reproject(reprojection: Reprojection, depths: &Tensor, motions: &Tensor) -> Result<Tensor> {
     apply(reprojection, [depths, motions])
@@ -99,19 +99,22 @@ struct FoundTogether {
     depth: OfPlaces,
 }
 
+/// Of the pixels from `first` on.
 #[inline(always)]
-fn found_together(viewer: Viewer, size: ImageSize, depths: &[f32], motion: Motion, rays: &[[f32; 3]]) -> FoundTogether {
+fn found_together(camera: &ViewerRays, depths: SampledImage, motion: Motion, first: usize) -> FoundTogether {
+    let (viewer, rays) = (camera.viewer, camera.together(first));
     let mut directions = [[0.0; SAMPLED_TOGETHER]; 3];
-    for (at, &ray) in rays.iter().enumerate() {
+    for at in 0..SAMPLED_TOGETHER {
+        let ray = [rays[0][at], rays[1][at], rays[2][at]];
         [directions[0][at], directions[1][at], directions[2][at]] = rotated(ray, motion.sin, motion.cos);
     }
     let turned = viewer.project_together(&directions);
-    let mut found = size.sample(depths, &turned);
+    let mut found = depths.sample(&turned);
     let mut corrected_at = turned;
     for _ in 0..ROUNDS {
         let points = motion.points(&directions, &found);
         corrected_at = viewer.project_together(&points);
-        let seen = size.sample(depths, &corrected_at);
+        let seen = depths.sample(&corrected_at);
         for at in 0..SAMPLED_TOGETHER {
             let depth = viewer.depth([points[0][at], points[1][at], points[2][at]]);
             let factor = seen[at] / depth.max(MIN_DEPTH);
@@ -138,6 +141,15 @@ impl Reprojection {
         }
         bail!("{:?} depths do not fit {:?} motions", depths.dims(), motions.dims())
     }
+
+    #[inline(always)]
+    fn sampled<'v>(&self, pixels: &'v [f32], instructions: Instructions) -> SampledImage<'v> {
+        SampledImage {
+            size: self.size,
+            pixels,
+            instructions,
+        }
+    }
 }
 
 impl FusedOperation<2> for Reprojection {
@@ -150,28 +162,26 @@ impl FusedOperation<2> for Reprojection {
         let outs = out.chunks_exact_mut(pixels * PLACE_VALUES);
         for ((out, motion), &context) in outs.zip(motions.values.chunks_exact(3)).zip(&self.context_of) {
             let context = context as usize;
-            let (ViewerRays { viewer, rays }, motion) = (&self.cameras[context], Motion::of(motion));
+            let (camera, motion) = (&self.cameras[context], Motion::of(motion));
             let depths = &depths.values[context * pixels..(context + 1) * pixels];
-            vectorized(
+            vectorized_by(
                 #[inline(always)]
-                || {
-                    let outs = out.chunks_mut(SAMPLED_TOGETHER * PLACE_VALUES);
-                    for (out, rays) in outs.zip(rays.chunks(SAMPLED_TOGETHER)) {
-                        let found = found_together(*viewer, self.size, depths, motion, rays);
+                |instructions| {
+                    let depths = self.sampled(depths, instructions);
+                    for first in (0..pixels).step_by(SAMPLED_TOGETHER) {
+                        let found = found_together(camera, depths, motion, first);
                         let FoundTogether {
                             turned, room, depth, ..
                         } = &found;
                         let values = [&turned[0], &turned[1], &room[0], &room[1], depth];
-                        for (at, out) in out.chunks_exact_mut(PLACE_VALUES).enumerate() {
-                            for (out, value) in out.iter_mut().zip(values) {
-                                *out = value[at];
-                            }
+                        for (nth, values) in values.into_iter().enumerate() {
+                            write_together(values, &mut out[nth * pixels..][..pixels], first);
                         }
                     }
                 },
             );
         }
-        Ok((out, Shape::from((items, pixels, PLACE_VALUES))))
+        Ok((out, Shape::from((items, PLACE_VALUES, pixels))))
     }
 
     /// As if the surroundings of each place were equally deep, and its depth had settled.
@@ -185,25 +195,29 @@ impl FusedOperation<2> for Reprojection {
         let (mut for_depths, mut for_motions) = (vec![0.0; depths.values.len()], vec![0.0; motions.values.len()]);
         for (item, &context) in self.context_of.iter().enumerate() {
             let context = context as usize;
-            let ViewerRays { viewer, rays } = &self.cameras[context];
+            let camera = &self.cameras[context];
             let motion = Motion::of(&motions.values[3 * item..]);
             let own = context * pixels..(context + 1) * pixels;
             let (depths, for_depths) = (&depths.values[own.clone()], &mut for_depths[own]);
             let gradients = &gradient.values[item * pixels * PLACE_VALUES..(item + 1) * pixels * PLACE_VALUES];
             let mut sums = [0.0f32; 3];
-            vectorized(
+            vectorized_by(
                 #[inline(always)]
-                || {
-                    let parts = gradients.chunks(SAMPLED_TOGETHER * PLACE_VALUES);
-                    for (gradients, rays) in parts.zip(rays.chunks(SAMPLED_TOGETHER)) {
-                        let found = found_together(*viewer, self.size, depths, motion, rays);
-                        let pixels = gradients.chunks_exact(PLACE_VALUES).zip(rays).enumerate();
-                        for (at, (gradient, &ray)) in pixels {
+                |instructions| {
+                    let depths = self.sampled(depths, instructions);
+                    for first in (0..pixels).step_by(SAMPLED_TOGETHER) {
+                        let found = found_together(camera, depths, motion, first);
+                        for at in 0..SAMPLED_TOGETHER.min(pixels - first) {
+                            let (pixel, ray) = (first + at, camera.rays[first + at]);
+                            let gradient = std::array::from_fn(
+                                #[inline(always)]
+                                |value| gradients[value * pixels + pixel],
+                            );
                             let found = Found {
                                 depth: found.depth[at],
                                 around: self.size.around(found.corrected_at[0][at], found.corrected_at[1][at]),
                             };
-                            let of_pixel = pixel_gradient(*viewer, motion, ray, &found, gradient);
+                            let of_pixel = pixel_gradient(camera.viewer, motion, ray, &found, gradient);
                             for (sum, part) in sums.iter_mut().zip(of_pixel.motion) {
                                 *sum += part;
                             }
@@ -227,7 +241,7 @@ struct PixelGradient {
 }
 
 #[inline(always)]
-fn pixel_gradient(viewer: Viewer, motion: Motion, ray: [f32; 3], found: &Found, gradient: &[f32]) -> PixelGradient {
+fn pixel_gradient(viewer: Viewer, motion: Motion, ray: [f32; 3], found: &Found, gradient: [f32; 4]) -> PixelGradient {
     let direction = rotated(ray, motion.sin, motion.cos);
     let turn = [-direction[1], direction[0], 0.0];
     let room = [gradient[2], gradient[3]];
@@ -284,7 +298,7 @@ mod tests {
             ..reprojection()
         };
         let places = reproject(flat, &wall(3.0), &motions).unwrap();
-        let places = places.get(0).unwrap().to_vec2::<f32>().unwrap();
+        let places = places.get(0).unwrap().t().unwrap().to_vec2::<f32>().unwrap();
         for (pixel, place) in places.iter().enumerate() {
             let (x, y) = ((pixel % 8) as f32 - 3.5, (pixel / 8) as f32 - 2.5);
             // The wall is 2.5 m away now and was 3 m away.
@@ -304,10 +318,10 @@ mod tests {
         )
         .unwrap();
         assert_gradients(&[wall(2.0)], 1e-2, |inputs| {
-            reproject(reprojection(), &inputs[0], &motions)?.narrow(2, 0, 4)
+            reproject(reprojection(), &inputs[0], &motions)?.narrow(1, 0, 4)
         });
         assert_gradients(std::slice::from_ref(&motions), 1e-2, |inputs| {
-            reproject(reprojection(), &wall(2.0), &inputs[0])?.narrow(2, 0, 4)
+            reproject(reprojection(), &wall(2.0), &inputs[0])?.narrow(1, 0, 4)
         });
     }
 }

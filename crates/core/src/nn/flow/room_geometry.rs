@@ -5,14 +5,13 @@
 #![allow(clippy::inline_always)]
 
 use std::ops::Range;
-use std::sync::Arc;
 
 use candle_core::{Result, Shape, Tensor};
 
 use crate::frame::warp::CameraModel;
 use crate::nn::fused::{FusedOperation, Operand, apply};
-use crate::nn::geometry::camera::{CameraPose, Viewer, rotated};
-use crate::nn::ops::sampling::ImageSize;
+use crate::nn::geometry::camera::{CameraPose, Viewer, ViewerRays, rotated};
+use crate::nn::ops::sampling::{ImageSize, SAMPLED_TOGETHER};
 use crate::nn::tensors::with_values;
 use crate::vectorized::vectorized;
 
@@ -79,16 +78,24 @@ impl RoomSides {
         let (mut time, mut side) = (f32::MAX, 0);
         for axis in 0..3 {
             let speed = ray.direction[axis];
-            let far = usize::from(speed > 0.0);
+            let (far, at) = if speed > 0.0 {
+                (1, self.0[2 * axis + 1])
+            } else {
+                (0, self.0[2 * axis])
+            };
             let speed = if speed.abs() < 1e-6 { 1e-6 } else { speed };
-            let until = (self.0[2 * axis + far] - ray.origin[axis]) / speed;
+            let until = (at - ray.origin[axis]) / speed;
             if until < time {
                 (time, side) = (until, 2 * axis + far);
             }
         }
         let time = time.max(MIN_DISTANCE);
         RoomHit {
-            point: std::array::from_fn(|axis| ray.origin[axis] + time * ray.direction[axis]),
+            point: [
+                ray.origin[0] + time * ray.direction[0],
+                ray.origin[1] + time * ray.direction[1],
+                ray.origin[2] + time * ray.direction[2],
+            ],
             side,
             time,
         }
@@ -101,8 +108,8 @@ pub(super) struct ViewInRoom {
     pub(super) pose: CameraPose,
     /// How far the camera is above the height from which the room was learned, in metres.
     pub(super) above: f32,
-    /// In the robot's axes; as many in all views.
-    pub(super) rays: Arc<Vec<[f32; 3]>>,
+    /// With as many rays in all views.
+    pub(super) camera: ViewerRays,
 }
 
 impl ViewInRoom {
@@ -119,9 +126,9 @@ impl ViewInRoom {
             views.push(Self {
                 pose,
                 above: above(camera, learned_by),
-                rays: before.map_or_else(
-                    || Arc::new(Viewer::new(camera, size).rays()),
-                    |before| Arc::clone(&views[before].rays),
+                camera: before.map_or_else(
+                    || Viewer::new(camera, size).into(),
+                    |before| views[before].camera.clone(),
                 ),
             });
         }
@@ -145,7 +152,7 @@ pub(super) struct RoomViews {
 impl RoomViews {
     /// Rays of all views.
     fn rays(&self) -> usize {
-        self.views.iter().map(|view| view.rays.len()).sum()
+        self.views.iter().map(|view| view.camera.rays.len()).sum()
     }
 
     #[inline(always)]
@@ -158,10 +165,10 @@ impl RoomViews {
     #[inline(always)]
     fn visit(&self, mut visit: impl FnMut(Range<usize>, RoomRay)) {
         let mut from = 0;
-        for ViewInRoom { pose, above, rays } in &self.views {
+        for ViewInRoom { pose, above, camera } in &self.views {
             let origin = self.origin(*pose, *above);
             let (sin, cos) = pose.heading.sin_cos();
-            for &ray in rays.iter() {
+            for &ray in camera.rays.iter() {
                 let direction = rotated(ray, sin, cos);
                 visit(from..from + RAY_VALUES, RoomRay { origin, direction });
                 from += RAY_VALUES;
@@ -179,19 +186,27 @@ impl RoomViews {
     pub(super) fn places_before(&self, sides: RoomSides, viewer: Viewer, before: &[CameraPose]) -> Vec<f32> {
         let mut places = vec![0.0; 2 * self.rays()];
         let mut rest = places.as_mut_slice();
-        for (ViewInRoom { pose, above, rays }, from) in self.views.iter().zip(before) {
-            let (places, later) = rest.split_at_mut(2 * rays.len());
+        for (ViewInRoom { pose, above, camera }, from) in self.views.iter().zip(before) {
+            let (places, later) = rest.split_at_mut(2 * camera.rays.len());
             rest = later;
             let [origin, seen_from] = [pose, from].map(|pose| self.origin(*pose, *above));
             let [(sin, cos), (sin_before, cos_before)] = [pose, from].map(|pose| pose.heading.sin_cos());
             vectorized(
                 #[inline(always)]
                 || {
-                    for (place, &ray) in places.chunks_exact_mut(2).zip(rays.iter()) {
-                        let direction = rotated(ray, sin, cos);
-                        let hit = sides.hit(RoomRay { origin, direction });
-                        let relative = std::array::from_fn(|axis| hit.point[axis] - seen_from[axis]);
-                        place.copy_from_slice(&viewer.project(rotated(relative, -sin_before, cos_before)));
+                    for (part, places) in places.chunks_mut(2 * SAMPLED_TOGETHER).enumerate() {
+                        let rays = camera.together(part * SAMPLED_TOGETHER);
+                        let mut points = [[0.0; SAMPLED_TOGETHER]; 3];
+                        for at in 0..SAMPLED_TOGETHER {
+                            let direction = rotated([rays[0][at], rays[1][at], rays[2][at]], sin, cos);
+                            let [x, y, z] = sides.hit(RoomRay { origin, direction }).point;
+                            let relative = [x - seen_from[0], y - seen_from[1], z - seen_from[2]];
+                            [points[0][at], points[1][at], points[2][at]] = rotated(relative, -sin_before, cos_before);
+                        }
+                        let [x, y] = viewer.project_together(&points);
+                        for (place, (x, y)) in places.as_chunks_mut::<2>().0.iter_mut().zip(x.into_iter().zip(y)) {
+                            *place = [x, y];
+                        }
                     }
                 },
             );

@@ -68,7 +68,12 @@ impl Viewer {
 
     /// The ray of each pixel in the robot's axes, row by row; 1 long along the camera's axis.
     pub(in crate::nn) fn rays(self) -> Vec<[f32; 3]> {
-        self.view.rays(self.size.width, self.size.height).collect()
+        let ImageSize { height, width } = self.size;
+        let mut rays = Vec::with_capacity(self.size.pixels());
+        for row in 0..height {
+            rays.extend((0..width).map(|column| self.view.ray(column, row)));
+        }
+        rays
     }
 
     /// The place of a point in the robot's axes.
@@ -137,14 +142,38 @@ impl Viewer {
 pub(in crate::nn) struct ViewerRays {
     pub(in crate::nn) viewer: Viewer,
     pub(in crate::nn) rays: Arc<[[f32; 3]]>,
+    /// The same, each axis on its own, and zeros after the last pixel.
+    axes: Arc<[Vec<f32>; 3]>,
 }
 
 impl From<Viewer> for ViewerRays {
     fn from(viewer: Viewer) -> Self {
+        let rays = viewer.rays();
+        let axis = |axis: usize| {
+            let mut values = Vec::with_capacity(rays.len() + SAMPLED_TOGETHER);
+            values.extend(rays.iter().map(|ray| ray[axis]));
+            values.resize(rays.len() + SAMPLED_TOGETHER, 0.0);
+            values
+        };
         Self {
             viewer,
-            rays: viewer.rays().into(),
+            axes: Arc::new([axis(0), axis(1), axis(2)]),
+            rays: rays.into(),
         }
+    }
+}
+
+impl ViewerRays {
+    /// The rays of neighbouring pixels, from one on, by axis.
+    #[inline(always)]
+    #[expect(clippy::expect_used, reason = "there are so many zeros after the last pixel")]
+    pub(in crate::nn) fn together(&self, first: usize) -> [&OfPlaces; 3] {
+        // Not `map`, which is not inlined.
+        let [x, y, z] = &*self.axes;
+        let x = x[first..].first_chunk().expect("a ray after the last pixel is a bug");
+        let y = y[first..].first_chunk().expect("a ray after the last pixel is a bug");
+        let z = z[first..].first_chunk().expect("a ray after the last pixel is a bug");
+        [x, y, z]
     }
 }
 

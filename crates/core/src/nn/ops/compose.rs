@@ -6,9 +6,10 @@
 use candle_core::{Result, Shape, Tensor, bail};
 
 use super::activation::exp;
-use super::sampling::{ImageSize, Neighbourhood, SAMPLED_TOGETHER};
+use super::gathering::of_pairs;
+use super::sampling::{ImageSize, Neighbourhood, PixelPlaces, SAMPLED_TOGETHER, SampledImage, write_together};
 use crate::nn::fused::{FusedOperation, Operand, apply};
-use crate::vectorized::vectorized;
+use crate::vectorized::{Instructions, vectorized, vectorized_by};
 
 /// Numbers that the head gives for each pixel: two flows (column, row), three mask logits, one change of the content.
 pub(in crate::nn) const HEAD_VALUES: usize = 8;
@@ -43,7 +44,7 @@ pub(in crate::nn) enum RoomPlaces {
     Turned,
     /// There, `[M, P, 2]`; no gradient goes to them.
     Known(Vec<f32>),
-    /// In the tensor of places, after the place before the turn; gradients go to them.
+    /// In the tensor of places, which is then `[M, 4 or more, P]`: columns and rows before the turn, then those; gradients go to them.
     Tracked,
 }
 
@@ -59,8 +60,8 @@ struct PixelParts {
 
 impl Composition {
     /// The frames `[M, P]`. `head` is `[M, H/2, W/2, 4 · HEAD_VALUES]`, `scene` `[M, H/2, W/2, 4 or more]` with the content in
-    /// its last four channels, `places` `[M, P, 2 or more]` where each pixel was before the camera turned (and, if tracked,
-    /// where it was before it also drove). Gradients go to all three.
+    /// its last four channels, `places` `[M, P, 2]` where each pixel was before the camera turned (if tracked, as
+    /// [`RoomPlaces::Tracked`] says). Gradients go to all three.
     pub(in crate::nn) fn compose(self, head: &Tensor, scene: &Tensor, places: &Tensor) -> Result<Tensor> {
         apply(self, [head, scene, places])
     }
@@ -71,10 +72,11 @@ impl Composition {
     fn visit(&self, [heads, scene, places]: [Operand; 3], mut visit: impl FnMut([usize; 3], PixelParts, &[f32])) {
         let ImageSize { height, width } = self.size;
         let pixels = self.size.pixels();
-        let (scene_channels, place_values) = (last_side(scene), last_side(places));
+        let scene_channels = last_side(scene);
         for (item, &frame) in self.frame_of.iter().enumerate() {
             let from = frame as usize * pixels;
             let frame = &self.frames[from..from + pixels];
+            let of_pixels = self.places_of(places, item);
             for row in 0..height {
                 for column in 0..width {
                     let block = (item * (height / 2) + row / 2) * (width / 2) + column / 2;
@@ -82,13 +84,8 @@ impl Composition {
                     let pixel = item * pixels + row * width + column;
                     let head = (block * 4 + part) * HEAD_VALUES;
                     let content = (block + 1) * scene_channels - 4 + part;
-                    let at = &places.values[pixel * place_values..(pixel + 1) * place_values];
-                    let turned = [at[0], at[1]];
-                    let room = match &self.room {
-                        RoomPlaces::Turned => turned,
-                        RoomPlaces::Known(room) => [room[2 * pixel], room[2 * pixel + 1]],
-                        RoomPlaces::Tracked => [at[2], at[3]],
-                    };
+                    let at = row * width + column;
+                    let (turned, room) = (of_pixels[0].at(at), of_pixels[1].at(at));
                     let head_values = &heads.values[head..head + HEAD_VALUES];
                     let parts = self.parts(head_values, scene.values[content], [room, turned], frame);
                     visit([pixel, head, content], parts, frame);
@@ -97,34 +94,68 @@ impl Composition {
         }
     }
 
+    /// The indices, in the tensor of places, of where a pixel (counted over all items) was before the turn, and of where it was
+    /// tracked to.
+    #[inline(always)]
+    fn indices(&self, places: Operand, pixel: usize) -> [[usize; 2]; 2] {
+        if !matches!(self.room, RoomPlaces::Tracked) {
+            return [[2 * pixel, 2 * pixel + 1]; 2];
+        }
+        let (pixels, values) = (self.size.pixels(), places.dims()[1]);
+        let first = pixel / pixels * values * pixels + pixel % pixels;
+        [[first, first + pixels], [first + 2 * pixels, first + 3 * pixels]]
+    }
+
+    /// Where each pixel of an item was before the turn, and where it was in the room.
+    #[inline(always)]
+    fn places_of<'v>(&'v self, places: Operand<'v>, item: usize) -> [PixelPlaces<'v>; 2] {
+        let pixels = self.size.pixels();
+        let pairs = |places: &'v [f32]| PixelPlaces::Pairs(&places[2 * item * pixels..2 * (item + 1) * pixels]);
+        match &self.room {
+            RoomPlaces::Turned => [pairs(places.values); 2],
+            RoomPlaces::Known(room) => [pairs(places.values), pairs(room)],
+            RoomPlaces::Tracked => {
+                let [turned, tracked] = self.indices(places, item * pixels);
+                let axis = |first: usize| &places.values[first..first + pixels];
+                [
+                    PixelPlaces::Axes([axis(turned[0]), axis(turned[1])]),
+                    PixelPlaces::Axes([axis(tracked[0]), axis(tracked[1])]),
+                ]
+            }
+        }
+    }
+
     /// Writes some neighbouring pixels of a row (counted over all items) from a column on. The same arithmetic as
     /// [`Composition::parts`] and [`PixelParts::mixed`].
     #[inline(always)]
-    fn mix(&self, [heads, scene, places]: [Operand; 3], [row, column]: [usize; 2], out: &mut [f32]) {
+    fn mix(
+        &self,
+        [heads, scene, places]: [Operand; 3],
+        [row, column]: [usize; 2],
+        out: &mut [f32],
+        instructions: Instructions,
+    ) {
         let ImageSize { height, width } = self.size;
-        let (scene_channels, place_values) = (last_side(scene), last_side(places));
+        let scene_channels = last_side(scene);
         let from = self.frame_of[row / height] as usize * self.size.pixels();
-        let frame = &self.frames[from..from + self.size.pixels()];
-        let mut head = [[0.0; SAMPLED_TOGETHER]; HEAD_VALUES];
+        let frame = SampledImage {
+            size: self.size,
+            pixels: &self.frames[from..from + self.size.pixels()],
+            instructions,
+        };
+        let (of_item, pixel) = (self.places_of(places, row / height), row % height * width + column);
+        let (turned, room) = (of_item[0].together(pixel), of_item[1].together(pixel));
+        // The two lower or upper pixels of each block.
+        let half = row % 2 * 2;
+        let first_block = row / 2 * (width / 2) + column / 2;
+        let mut pairs = [[0.0; 2 * HEAD_VALUES]; SAMPLED_TOGETHER / 2];
         let mut content = [0.0; SAMPLED_TOGETHER];
-        let [mut turned, mut room] = [[[0.0; SAMPLED_TOGETHER]; 2]; 2];
-        for at in 0..out.len() {
-            let (column, pixel) = (column + at, row * width + column + at);
-            let block = row / 2 * (width / 2) + column / 2;
-            let part = row % 2 * 2 + column % 2;
-            let values = &heads.values[(block * 4 + part) * HEAD_VALUES..][..HEAD_VALUES];
-            for (head, value) in head.iter_mut().zip(values) {
-                head[at] = *value;
-            }
-            content[at] = scene.values[(block + 1) * scene_channels - 4 + part];
-            let place = &places.values[pixel * place_values..][..place_values];
-            [turned[0][at], turned[1][at]] = [place[0], place[1]];
-            [room[0][at], room[1][at]] = match &self.room {
-                RoomPlaces::Turned => [place[0], place[1]],
-                RoomPlaces::Known(room) => [room[2 * pixel], room[2 * pixel + 1]],
-                RoomPlaces::Tracked => [place[2], place[3]],
-            };
+        for at in 0..out.len().div_ceil(2) {
+            let block = first_block + at;
+            pairs[at].copy_from_slice(&heads.values[(4 * block + half) * HEAD_VALUES..][..2 * HEAD_VALUES]);
+            content[2 * at..2 * at + 2].copy_from_slice(&scene.values[(block + 1) * scene_channels - 4 + half..][..2]);
         }
+        let head = of_pairs(&pairs, instructions);
         let [mut first, mut second] = [[[0.0; SAMPLED_TOGETHER]; 2]; 2];
         for axis in 0..2 {
             for at in 0..SAMPLED_TOGETHER {
@@ -132,7 +163,7 @@ impl Composition {
                 second[axis][at] = turned[axis][at] + FLOW_PX * head[2 + axis][at];
             }
         }
-        let (first, second) = (self.size.sample(frame, &first), self.size.sample(frame, &second));
+        let (first, second) = (frame.sample(&first), frame.sample(&second));
         let mut mixed = [0.0; SAMPLED_TOGETHER];
         for at in 0..SAMPLED_TOGETHER {
             let logits = [
@@ -146,7 +177,7 @@ impl Composition {
             let content = content[at] + head[7][at];
             mixed[at] = first[at] * (shares[0] / sum) + second[at] * (shares[1] / sum) + content * (shares[2] / sum);
         }
-        out.copy_from_slice(&mixed[..out.len()]);
+        write_together(&mixed, out, 0);
     }
 
     /// The parts of a pixel from its head values, content and places.
@@ -184,18 +215,16 @@ impl Composition {
         let [head, scene, places] = inputs.map(|input| input.dims());
         let fits = head == [items, height / 2, width / 2, 4 * HEAD_VALUES]
             && matches!(*scene, [scenes, h, w, 4..=SCENE_CHANNELS] if [scenes, h, w] == [items, height / 2, width / 2])
-            && matches!(*places, [places, pixels, values] if [places, pixels] == [items, height * width] && values >= self.room.values());
+            && match &self.room {
+                RoomPlaces::Tracked => {
+                    matches!(*places, [places, values, pixels] if values >= 4 && [places, pixels] == [items, height * width])
+                }
+                RoomPlaces::Turned | RoomPlaces::Known(_) => places == [items, height * width, 2],
+            };
         if fits {
             return Ok(());
         }
         bail!("{items} frames of {width}×{height} are not composed of {head:?}, {scene:?} and {places:?}")
-    }
-}
-
-impl RoomPlaces {
-    /// Values of a pixel in the tensor of places.
-    fn values(&self) -> usize {
-        if matches!(self, Self::Tracked) { 4 } else { 2 }
     }
 }
 
@@ -204,9 +233,9 @@ fn last_side(operand: Operand) -> usize {
 }
 
 #[inline(always)]
-fn add(sums: &mut [f32], values: [f32; 2]) {
-    for (sum, value) in sums.iter_mut().zip(values) {
-        *sum += value;
+fn add(sums: &mut [f32], indices: [usize; 2], values: [f32; 2]) {
+    for (index, value) in indices.into_iter().zip(values) {
+        sums[index] += value;
     }
 }
 
@@ -218,12 +247,12 @@ impl FusedOperation<3> for Composition {
         let (items, pixels) = (self.frame_of.len(), self.size.pixels());
         let mut out = vec![0.0; items * pixels];
         let rows = out.chunks_exact_mut(self.size.width).enumerate();
-        vectorized(
+        vectorized_by(
             #[inline(always)]
-            || {
+            |instructions| {
                 for (row, out) in rows {
                     for (part, out) in out.chunks_mut(SAMPLED_TOGETHER).enumerate() {
-                        self.mix(inputs, [row, part * SAMPLED_TOGETHER], out);
+                        self.mix(inputs, [row, part * SAMPLED_TOGETHER], out, instructions);
                     }
                 }
             },
@@ -233,7 +262,6 @@ impl FusedOperation<3> for Composition {
 
     fn backward(&self, inputs: [Operand; 3], _output: Operand, gradient: Operand) -> Result<[Option<Vec<f32>>; 3]> {
         let [mut for_head, mut for_scene, mut for_places] = inputs.map(|input| vec![0.0; input.values.len()]);
-        let values = last_side(inputs[2]);
         vectorized(
             #[inline(always)]
             || {
@@ -243,12 +271,12 @@ impl FusedOperation<3> for Composition {
                     |[pixel, head, content], parts, frame| {
                         let gradient = gradient.values[pixel];
                         let [room, turned] = parts.gradient(gradient, frame, &mut for_head[head..head + HEAD_VALUES]);
-                        let at = &mut for_places[pixel * values..(pixel + 1) * values];
-                        add(&mut at[..2], turned);
+                        let [turned_at, tracked_at] = self.indices(inputs[2], pixel);
+                        add(&mut for_places, turned_at, turned);
                         match &self.room {
-                            RoomPlaces::Turned => add(&mut at[..2], room),
+                            RoomPlaces::Turned => add(&mut for_places, turned_at, room),
                             RoomPlaces::Known(_) => (),
-                            RoomPlaces::Tracked => add(&mut at[2..4], room),
+                            RoomPlaces::Tracked => add(&mut for_places, tracked_at, room),
                         }
                         for_scene[content] = gradient * parts.mask[2];
                     },
@@ -332,7 +360,7 @@ mod tests {
         let inputs = [
             (noise(&[3, 2, 3, 32], 3) * 0.3).unwrap(),
             noise(&[3, 2, 3, 4], 4),
-            noise(&[3, 24, 4], 5).affine(1.2, 1.37).unwrap(),
+            noise(&[3, 4, 24], 5).affine(1.2, 1.37).unwrap(),
         ];
         assert_gradients(&inputs[2..], 1e-4, |tensors| {
             let tracked = Composition {

@@ -4,8 +4,9 @@
 
 use candle_core::{Result, Shape, Tensor, bail};
 
+use super::gathering::corners;
 use crate::nn::fused::{FusedOperation, Operand, apply};
-use crate::vectorized::{vectorized, whole};
+use crate::vectorized::{Instructions, vectorized, whole};
 
 /// The four pixels around a place, and the shares of the right column and of the lower row.
 #[derive(Clone, Copy)]
@@ -19,7 +20,7 @@ pub(in crate::nn) struct Neighbourhood {
 }
 
 /// Places that are sampled together, so that the arithmetic of all is a few vector instructions.
-pub(in crate::nn) const SAMPLED_TOGETHER: usize = 16;
+pub(in crate::nn) const SAMPLED_TOGETHER: usize = 32;
 
 /// One number of each of some places.
 pub(in crate::nn) type OfPlaces = [f32; SAMPLED_TOGETHER];
@@ -57,40 +58,6 @@ impl ImageSize {
         beyond(x, self.width) + beyond(y, self.height)
     }
 
-    /// The values of an image of one channel at several places: what [`ImageSize::around`] and [`Neighbourhood::sample`] give,
-    /// to the bit.
-    #[inline(always)]
-    pub(in crate::nn) fn sample(self, image: &[f32], [x, y]: &[OfPlaces; 2]) -> OfPlaces {
-        let (last_x, last_y) = ((self.width - 1) as f32, (self.height - 1) as f32);
-        let most_left = self.width.saturating_sub(2) as i32;
-        let most_top = self.height.saturating_sub(2) as i32;
-        let step_x = usize::from(self.width > 1);
-        let step_y = if self.height > 1 { self.width } else { 0 };
-        let (mut first, mut right, mut lower) = (
-            [0i32; SAMPLED_TOGETHER],
-            [0.0; SAMPLED_TOGETHER],
-            [0.0; SAMPLED_TOGETHER],
-        );
-        for at in 0..SAMPLED_TOGETHER {
-            let (inside_x, inside_y) = (x[at].clamp(0.0, last_x), y[at].clamp(0.0, last_y));
-            let (left, top) = (whole(inside_x).min(most_left), whole(inside_y).min(most_top));
-            first[at] = top * self.width as i32 + left;
-            right[at] = inside_x - left as f32;
-            lower[at] = inside_y - top as f32;
-        }
-        let [mut a, mut b, mut c, mut d] = [[0.0; SAMPLED_TOGETHER]; 4];
-        for at in 0..SAMPLED_TOGETHER {
-            let around = &image[first[at] as usize..][..=step_y + step_x];
-            [a[at], b[at], c[at], d[at]] = [0, step_x, step_y, step_y + step_x].map(|step| around[step]);
-        }
-        let mut values = [0.0; SAMPLED_TOGETHER];
-        for at in 0..SAMPLED_TOGETHER {
-            let upper = a[at] + (b[at] - a[at]) * right[at];
-            values[at] = upper + (c[at] + (d[at] - c[at]) * right[at] - upper) * lower[at];
-        }
-        values
-    }
-
     /// Around the place [column, row], counted from the first pixel's middle; beyond the border, the border's pixel.
     #[inline(always)]
     pub(in crate::nn) fn around(self, x: f32, y: f32) -> Neighbourhood {
@@ -108,6 +75,84 @@ impl ImageSize {
             lower: inside_y - top as f32,
             moves: [(0.0..=last_x).contains(&x), (0.0..=last_y).contains(&y)],
         }
+    }
+}
+
+/// A place for each pixel of an image, as columns and rows.
+#[derive(Clone, Copy)]
+pub(in crate::nn) enum PixelPlaces<'a> {
+    /// `[P, 2]`.
+    Pairs(&'a [f32]),
+    /// `[P]` each.
+    Axes([&'a [f32]; 2]),
+}
+
+impl PixelPlaces<'_> {
+    #[inline(always)]
+    pub(in crate::nn) fn at(self, pixel: usize) -> [f32; 2] {
+        match self {
+            Self::Pairs(pairs) => [pairs[2 * pixel], pairs[2 * pixel + 1]],
+            Self::Axes([x, y]) => [x[pixel], y[pixel]],
+        }
+    }
+
+    /// Those of neighbouring pixels from one on; zeros after the last pixel.
+    #[inline(always)]
+    pub(in crate::nn) fn together(self, first: usize) -> [OfPlaces; 2] {
+        let pairs = match self {
+            Self::Axes([x, y]) => return [read_together(x, first), read_together(y, first)],
+            Self::Pairs(pairs) => &pairs[2 * first..],
+        };
+        let mut read = [0.0; 2 * SAMPLED_TOGETHER];
+        match pairs.first_chunk() {
+            Some(pairs) => read = *pairs,
+            None => read[..pairs.len()].copy_from_slice(pairs),
+        }
+        let mut together = [[0.0; SAMPLED_TOGETHER]; 2];
+        for at in 0..SAMPLED_TOGETHER {
+            [together[0][at], together[1][at]] = [read[2 * at], read[2 * at + 1]];
+        }
+        together
+    }
+}
+
+/// An image of one channel, sampled in a vectorized loop.
+#[derive(Clone, Copy)]
+pub(in crate::nn) struct SampledImage<'a> {
+    pub(in crate::nn) size: ImageSize,
+    pub(in crate::nn) pixels: &'a [f32],
+    /// Those of the loop.
+    pub(in crate::nn) instructions: Instructions,
+}
+
+impl SampledImage<'_> {
+    /// The values at several places: what [`ImageSize::around`] and [`Neighbourhood::sample`] give, to the bit.
+    #[inline(always)]
+    pub(in crate::nn) fn sample(self, [x, y]: &[OfPlaces; 2]) -> OfPlaces {
+        let ImageSize { height, width } = self.size;
+        let (last_x, last_y) = ((width - 1) as f32, (height - 1) as f32);
+        let (most_left, most_top) = (width.saturating_sub(2) as i32, height.saturating_sub(2) as i32);
+        let (mut first, mut right, mut lower) = (
+            [0i32; SAMPLED_TOGETHER],
+            [0.0; SAMPLED_TOGETHER],
+            [0.0; SAMPLED_TOGETHER],
+        );
+        for at in 0..SAMPLED_TOGETHER {
+            let (inside_x, inside_y) = (x[at].clamp(0.0, last_x), y[at].clamp(0.0, last_y));
+            let (left, top) = (whole(inside_x).min(most_left), whole(inside_y).min(most_top));
+            first[at] = top * width as i32 + left;
+            right[at] = inside_x - left as f32;
+            lower[at] = inside_y - top as f32;
+        }
+        let step_x = usize::from(width > 1);
+        let step_y = if height > 1 { width } else { 0 };
+        let [a, b, c, d] = corners(self.pixels, &first, [step_x, step_y], self.instructions);
+        let mut values = [0.0; SAMPLED_TOGETHER];
+        for at in 0..SAMPLED_TOGETHER {
+            let upper = a[at] + (b[at] - a[at]) * right[at];
+            values[at] = upper + (c[at] + (d[at] - c[at]) * right[at] - upper) * lower[at];
+        }
+        values
     }
 }
 
@@ -142,6 +187,30 @@ impl Neighbourhood {
             if self.moves[0] { along } else { 0.0 },
             if self.moves[1] { down } else { 0.0 },
         ]
+    }
+}
+
+/// The values of some neighbouring places from `first` on; zeros after the last place.
+#[inline(always)]
+pub(in crate::nn) fn read_together(values: &[f32], first: usize) -> OfPlaces {
+    let values = &values[first..];
+    match values.first_chunk() {
+        Some(values) => *values,
+        None => {
+            let mut filled = [0.0; SAMPLED_TOGETHER];
+            filled[..values.len()].copy_from_slice(values);
+            filled
+        }
+    }
+}
+
+/// Writes the values of some neighbouring places from `first` on; those beyond the last place are left out.
+#[inline(always)]
+pub(in crate::nn) fn write_together(values: &OfPlaces, out: &mut [f32], first: usize) {
+    let out = &mut out[first..];
+    match out.first_chunk_mut() {
+        Some(out) => *out = *values,
+        None => out.copy_from_slice(&values[..out.len()]),
     }
 }
 
@@ -242,6 +311,7 @@ fn add_scaled(sums: &mut [f32], values: &[f32], share: f32) {
 mod tests {
     use super::*;
     use crate::nn::gradient_check::{assert_gradients, noise};
+    use crate::vectorized::vectorized_by;
 
     #[test]
     fn a_place_between_pixels_mixes_the_four_around_it() {
@@ -262,9 +332,18 @@ mod tests {
                 let of_places = places.get(axis).unwrap().to_vec1::<f32>().unwrap();
                 OfPlaces::try_from(of_places).unwrap()
             });
-            let together = size.sample(&image, &[x, y]);
-            for at in 0..SAMPLED_TOGETHER {
-                assert_eq!(together[at], size.around(x[at], y[at]).sample(&image));
+            let together = |instructions| {
+                let image = SampledImage {
+                    size,
+                    pixels: &image,
+                    instructions,
+                };
+                image.sample(&[x, y])
+            };
+            for together in [together(Instructions::PLAIN), vectorized_by(together)] {
+                for at in 0..SAMPLED_TOGETHER {
+                    assert_eq!(together[at], size.around(x[at], y[at]).sample(&image));
+                }
             }
         }
     }

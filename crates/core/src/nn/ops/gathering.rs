@@ -1,0 +1,90 @@
+//! Values that are scattered in memory, as vectors with one number of each place.
+// A closure's vector instructions reach what is inlined into it, and only that.
+#![allow(clippy::inline_always)]
+
+#[cfg(target_arch = "x86_64")]
+mod x86;
+
+use super::sampling::{OfPlaces, SAMPLED_TOGETHER};
+use crate::vectorized::Instructions;
+
+/// Pairs of neighbouring pixels.
+const PAIRS: usize = SAMPLED_TOGETHER / 2;
+/// Values of each pixel of a pair.
+pub(super) const PAIR_VALUES: usize = 8;
+
+/// The pixels of an image at the indices `first`, and as many pixels later as the steps: one, the other, and both.
+#[inline(always)]
+pub(super) fn corners(
+    image: &[f32],
+    first: &[i32; SAMPLED_TOGETHER],
+    [step_x, step_y]: [usize; 2],
+    instructions: Instructions,
+) -> [OfPlaces; 4] {
+    #[cfg(target_arch = "x86_64")]
+    if instructions.have_avx512() && step_x == 1 {
+        return x86::corners(image, first, step_y, instructions);
+    }
+    let mut corners = [[0.0; SAMPLED_TOGETHER]; 4];
+    for at in 0..SAMPLED_TOGETHER {
+        let around = &image[first[at] as usize..][..=step_y + step_x];
+        for (corner, step) in corners.iter_mut().zip([0, step_x, step_y, step_y + step_x]) {
+            corner[at] = around[step];
+        }
+    }
+    corners
+}
+
+/// The values of pairs of pixels `[pixel, value]` each, by value.
+#[inline(always)]
+pub(super) fn of_pairs(pairs: &[[f32; 2 * PAIR_VALUES]; PAIRS], instructions: Instructions) -> [OfPlaces; PAIR_VALUES] {
+    #[cfg(target_arch = "x86_64")]
+    if instructions.have_avx512() {
+        return x86::of_pairs(pairs, instructions);
+    }
+    let mut values = [[0.0; SAMPLED_TOGETHER]; PAIR_VALUES];
+    for at in 0..SAMPLED_TOGETHER {
+        for (value, values) in values.iter_mut().enumerate() {
+            values[at] = pairs[at / 2][at % 2 * PAIR_VALUES + value];
+        }
+    }
+    values
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::vectorized::vectorized_by;
+
+    #[test]
+    fn the_values_of_pairs_are_those_of_their_pixels() {
+        let pairs: [[f32; 2 * PAIR_VALUES]; PAIRS] =
+            std::array::from_fn(|pair| std::array::from_fn(|at| (100 * pair + at) as f32));
+        let values = |instructions| of_pairs(&pairs, instructions);
+        for values in [values(Instructions::PLAIN), vectorized_by(values)] {
+            for (value, pixels) in values.iter().enumerate() {
+                for (pixel, &found) in pixels.iter().enumerate() {
+                    assert_eq!(found, (100 * (pixel / 2) + pixel % 2 * PAIR_VALUES + value) as f32);
+                }
+            }
+        }
+    }
+
+    #[test]
+    #[should_panic(expected = "out of range")]
+    fn places_beyond_an_image_are_not_read() {
+        corners(&[0.0; 40], &[23; SAMPLED_TOGETHER], [1, 16], Instructions::PLAIN);
+    }
+
+    #[test]
+    fn a_place_beyond_an_image_is_not_read_by_any_instruction() {
+        let image: Vec<f32> = (0..40).map(|pixel| pixel as f32).collect();
+        let mut first = [22; SAMPLED_TOGETHER];
+        let upper = |first| std::panic::catch_unwind(|| vectorized_by(|with| corners(&image, &first, [1, 16], with)));
+        assert_eq!(upper(first).unwrap().map(|corner| corner[5]), [22.0, 23.0, 38.0, 39.0]);
+        for wrong in [23, i32::MAX, -1] {
+            first[5] = wrong;
+            assert!(upper(first).is_err(), "{wrong}");
+        }
+    }
+}
