@@ -44,3 +44,4 @@ pub(super) use layers::{multiply_adds_per_frame, tensor_shapes};
 pub(super) use network::FlowNetwork;
 pub use network::FlowPrediction;
 pub use occupancy::Occupancy;
+pub(super) use predict::Asked;

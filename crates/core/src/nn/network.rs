@@ -8,7 +8,7 @@ use super::conditioning::ConditioningTensors;
 use super::dense::{DenseNetwork, Feedback};
 use super::device;
 use super::error::NnError;
-use super::flow::{FlowNetwork, FlowPrediction, Occupancy};
+use super::flow::{Asked, FlowNetwork, FlowPrediction, Occupancy};
 use super::geometry::state_channels::StateChannels;
 use super::geometry::wheel_dynamics;
 use super::model_tensors::ModelTensors;
@@ -147,7 +147,13 @@ impl Network {
         self.check_windows(codes)?;
         match &self.network {
             AnyNetwork::Dense(dense) => dense.predict_rollouts(codes, windows, conditioning),
-            AnyNetwork::Flow(flow) => Ok(flow.predict(codes, windows, conditioning, self.spec.horizon)?.frames),
+            AnyNetwork::Flow(flow) => {
+                let asked = Asked {
+                    steps: self.spec.horizon,
+                    only_frames: true,
+                };
+                Ok(flow.predict(codes, windows, conditioning, asked)?.frames)
+            }
         }
     }
 
@@ -184,7 +190,13 @@ impl Network {
         in_range("steps", steps as f64, 1.0, self.spec.horizon as f64)?;
         match &self.network {
             AnyNetwork::Dense(_) => Ok(None),
-            AnyNetwork::Flow(flow) => flow.predict(frames, &each_once(batch), conditioning, steps).map(Some),
+            AnyNetwork::Flow(flow) => {
+                let asked = Asked {
+                    steps,
+                    only_frames: false,
+                };
+                flow.predict(frames, &each_once(batch), conditioning, asked).map(Some)
+            }
         }
     }
 

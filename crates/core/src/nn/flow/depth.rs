@@ -149,7 +149,8 @@ impl FlowNetwork {
         let features = self.encode(contexts.count(), inputs, remembered.as_ref())?;
         let depths = head.forward(&features, &views)?;
         let [coarse, _] = features;
-        let movers = self.movers.as_ref().map(|movers| movers.seen(&coarse)).transpose()?;
+        let movers = self.movers.as_ref().filter(|_| !rows.only_frames);
+        let movers = movers.map(|movers| movers.seen(&coarse)).transpose()?;
         Ok(SeenDepths {
             views,
             coarse,
@@ -193,7 +194,8 @@ impl FlowNetwork {
             seen,
             state,
         } = self.see_ahead(ahead, depths)?;
-        let movers = self.movers.as_ref().map(|movers| movers.coming(&state)).transpose()?;
+        let movers = self.movers.as_ref().filter(|_| !ahead.rows.only_frames);
+        let movers = movers.map(|movers| movers.coming(&state)).transpose()?;
         let moved = seen.moved_blocks(&views.frames, &context_of, size)?;
         let levels: Vec<[f32; 2]> = context_of
             .iter()
@@ -226,6 +228,7 @@ impl FlowNetwork {
         Ok(PredictedAhead {
             frames: frames.reshape(shape)?,
             scene: recalled
+                .filter(|_| !ahead.rows.only_frames)
                 .map(|recalled| recalled.intensities.reshape(shape))
                 .transpose()?,
             movers: movers.map(|movers| movers.reshape(shape)).transpose()?,

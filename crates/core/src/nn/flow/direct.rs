@@ -70,9 +70,11 @@ impl FlowNetwork {
             room: geometry.room.map_or(RoomPlaces::Turned, RoomPlaces::Known),
         };
         let frames = composition.compose(&head, &scene, &geometry.turned)?;
+        let content = || Ok::<_, NnError>(content_frames(&scene)?.reshape(shape)?);
+        let content = (!ahead.rows.only_frames).then(content).transpose()?;
         Ok(PredictedAhead {
             frames: frames.reshape(shape)?,
-            scene: Some(content_frames(&scene)?.reshape(shape)?),
+            scene: content,
             movers: None,
         })
     }

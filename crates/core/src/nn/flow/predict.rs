@@ -16,17 +16,27 @@ use super::steps_ahead::{PredictedAhead, StepsAhead};
 use crate::nn::conditioning::ConditioningTensors;
 use crate::nn::error::NnError;
 
+/// What a prediction has to give.
+#[derive(Clone, Copy, Debug)]
+pub(in crate::nn) struct Asked {
+    /// The frames of the first steps.
+    pub(in crate::nn) steps: usize,
+    /// Neither the scene nor the movers of each frame.
+    pub(in crate::nn) only_frames: bool,
+}
+
 impl FlowNetwork {
-    /// N rollouts of B windows of frames `[B, context, P]`, with the frames of the first `steps` only: rollout n follows
-    /// window `windows[n]` under row n of the conditioning. Errors: `Shape`, `Missing`.
+    /// What is asked of N rollouts of B windows of frames `[B, context, P]`: rollout n follows window `windows[n]` under row n of the
+    /// conditioning. Errors: `Shape`, `Missing`.
     pub(in crate::nn) fn predict(
         &self,
         frames: &Tensor,
         windows: &[u32],
         conditioning: &ConditioningTensors,
-        steps: usize,
+        Asked { steps, only_frames }: Asked,
     ) -> Result<FlowPrediction, NnError> {
-        let rows = RolloutRows::new(&self.spec, frames, windows, conditioning)?;
+        let mut rows = RolloutRows::new(&self.spec, frames, windows, conditioning)?;
+        rows.only_frames = only_frames;
         if self.is_plain {
             return self.plain_predict(&rows, steps);
         }

@@ -33,6 +33,8 @@ pub(super) struct RolloutRows<'a> {
     read: Vec<usize>,
     /// How fast the camera drives and turns, as seen in the frames; `None` where nothing needs it.
     seen_speeds: Option<SeenSpeeds>,
+    /// Whether only frames are asked for, neither the scene nor the movers of each.
+    pub(super) only_frames: bool,
 }
 
 /// Forward speed and yaw rate at the last frame of each rollout's context, as seen in the frames.
@@ -80,6 +82,7 @@ impl<'a> RolloutRows<'a> {
             cameras,
             read: spec.states_read_by_layers(),
             seen_speeds: None,
+            only_frames: false,
         })
     }
 
@@ -144,6 +147,7 @@ impl<'a> RolloutRows<'a> {
             past_states: self.of_rows(&self.past_states, range.clone()).to_vec(),
             cameras: self.cameras.get(range).unwrap_or_default().to_vec(),
             read: self.read.clone(),
+            only_frames: self.only_frames,
         }
     }
 
