@@ -308,8 +308,10 @@ fn each_once(windows: usize) -> Vec<u32> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::frame::warp::CameraModel;
+    use crate::nn::gradient_check::{noise, values};
     use crate::nn::options::Conditioning;
-    use crate::nn::spec::{ChannelScale, DenseSpec, FlowSpec};
+    use crate::nn::spec::{ChannelScale, DenseSpec, FlowLayers, FlowSpec};
     use crate::types::Seed;
 
     fn channel(name: &str, unit: &str) -> ChannelScale {
@@ -371,6 +373,33 @@ mod tests {
                 assert!((longer - trained).abs() < 1e-5);
             }
             assert!(values(longer).iter().all(|value| value.is_finite()));
+        }
+    }
+
+    #[test]
+    fn frames_alone_are_those_of_a_whole_prediction() {
+        let depth = FlowSpec {
+            camera: Some(CameraModel::USUAL),
+            layers: FlowLayers {
+                depth: true,
+                movers: true,
+                ..FlowLayers::default()
+            },
+            ..FlowSpec::default()
+        };
+        for flow in [FlowSpec::default(), depth] {
+            let spec = spec(Architecture::Flow(flow));
+            let model = Network::detached(spec.clone(), &Parameters::initialize(&spec, Seed(3)).unwrap()).unwrap();
+            let frames = noise(&[1, 3, 64], 1);
+            let conditioning = ConditioningTensors {
+                actions: Some(noise(&[1, 2, 2], 2)),
+                state: Some(noise(&[1, 4], 3)),
+                ..ConditioningTensors::none()
+            };
+            let whole = model.predict_flow(&frames, &conditioning, 2).unwrap().unwrap();
+            assert!(whole.scene.is_some() || whole.movers.is_some());
+            let alone = model.predict_rollouts(&frames, &[0], &conditioning).unwrap();
+            assert_eq!(values(&alone), values(&whole.frames));
         }
     }
 }

@@ -124,7 +124,7 @@ unsafe fn corners_within(image: &[f32], first: &[i32; LANES], below: usize) -> [
         ($row:expr, $place:expr) => {
             image
                 .as_ptr()
-                .wrapping_add($row + first[$place] as usize)
+                .wrapping_add($row + first[$place] as u32 as usize)
                 .cast::<f64>()
         };
     }
