@@ -385,7 +385,6 @@ mod tests {
                 movers: true,
                 ..FlowLayers::default()
             },
-            ..FlowSpec::default()
         };
         for flow in [FlowSpec::default(), depth] {
             let spec = spec(Architecture::Flow(flow));

@@ -194,14 +194,12 @@ impl Neighbourhood {
 #[inline(always)]
 pub(in crate::nn) fn read_together(values: &[f32], first: usize) -> OfPlaces {
     let values = &values[first..];
-    match values.first_chunk() {
-        Some(values) => *values,
-        None => {
-            let mut filled = [0.0; SAMPLED_TOGETHER];
-            filled[..values.len()].copy_from_slice(values);
-            filled
-        }
+    if let Some(values) = values.first_chunk() {
+        return *values;
     }
+    let mut filled = [0.0; SAMPLED_TOGETHER];
+    filled[..values.len()].copy_from_slice(values);
+    filled
 }
 
 /// Writes the values of some neighbouring places from `first` on; those beyond the last place are left out.

@@ -4,7 +4,7 @@
 #![allow(clippy::inline_always)]
 
 use std::arch::x86_64::{
-    __m512, __m512i, _mm_load_sd, _mm_loadh_pd, _mm256_castpd128_pd256, _mm256_insertf128_pd, _mm512_castpd_ps,
+    __m512, __m512i, _mm_setr_pd, _mm256_castpd128_pd256, _mm256_insertf128_pd, _mm512_castpd_ps,
     _mm512_castpd256_pd512, _mm512_insertf64x4, _mm512_max_epu32, _mm512_permutex2var_ps, _mm512_reduce_max_epu32,
     _mm512_setr_epi32, _mm512_setzero_ps, _mm512_setzero_si512,
 };
@@ -18,7 +18,10 @@ const LANES: usize = 16;
 
 /// As [`super::corners`], of images that are wider than a pixel.
 #[inline(always)]
-#[expect(unsafe_code, reason = "loads of 64 bits take pointers")]
+#[expect(
+    unsafe_code,
+    reason = "a check of each index would take longer than to read its pixels"
+)]
 pub(super) fn corners(
     image: &[f32],
     first: &[i32; SAMPLED_TOGETHER],
@@ -117,22 +120,23 @@ fn most(first: &[i32; SAMPLED_TOGETHER]) -> u32 {
 /// Each index, plus `below` and 1, is within the image.
 #[target_feature(enable = "avx512f")]
 #[inline]
-#[expect(unsafe_code, reason = "loads of 64 bits take pointers")]
+#[expect(
+    unsafe_code,
+    reason = "a check of each index would take longer than to read its pixels"
+)]
 unsafe fn corners_within(image: &[f32], first: &[i32; LANES], below: usize) -> [[f32; LANES]; 4] {
-    /// A pixel and its right neighbour. Macros, since the compiler does not inline as many calls.
+    /// A pixel and its right neighbour, as the bits of one number. Macros, since the compiler does not inline as many calls.
     macro_rules! pair {
-        ($row:expr, $place:expr) => {
-            image
-                .as_ptr()
-                .wrapping_add($row + first[$place] as u32 as usize)
-                .cast::<f64>()
-        };
+        ($row:expr, $place:expr) => {{
+            let left = image.as_ptr().wrapping_add($row + first[$place] as u32 as usize);
+            // SAFETY: the caller says that both are within the image.
+            number(unsafe { left.cast::<[f32; 2]>().read() })
+        }};
     }
     /// Those of two, four, eight places.
     macro_rules! two {
         ($row:expr, $place:expr) => {
-            // SAFETY: the caller says that both pairs are within the image.
-            unsafe { _mm_loadh_pd(_mm_load_sd(pair!($row, $place)), pair!($row, $place + 1)) }
+            _mm_setr_pd(pair!($row, $place), pair!($row, $place + 1))
         };
     }
     macro_rules! four {
@@ -166,7 +170,7 @@ macro_rules! casts {
             #[inline(always)]
             #[expect(unsafe_code, reason = "the standard library has no such conversion without pointers")]
             fn $name(bits: $from) -> $to {
-                // SAFETY: both types have 512 bits, and any bits are a value of each.
+                // SAFETY: both types have as many bits, and any bits are a value of each.
                 unsafe { std::mem::transmute::<$from, $to>(bits) }
             }
         )*
@@ -175,6 +179,7 @@ macro_rules! casts {
 
 casts! {
     indices: [i32; LANES] => __m512i;
+    number: [f32; 2] => f64;
     floats: [f32; LANES] => __m512;
     values: __m512 => [f32; LANES];
 }
