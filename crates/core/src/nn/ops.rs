@@ -6,7 +6,7 @@ mod bordered_convolution;
 mod byte_convolution;
 pub(super) mod compose;
 pub(super) mod convolution;
-mod gathering;
+pub(super) mod gathering;
 pub(super) mod image_geometry;
 pub(super) mod linear;
 pub(super) mod modulation;

@@ -5,8 +5,9 @@
 use candle_core::{Device, Result, Tensor};
 
 use crate::nn::ops::compose::{SCENE_CHANNELS, SCENE_FEATURES};
+use crate::nn::ops::gathering::SAMPLED_TOGETHER;
 use crate::nn::ops::pixel_shuffle::pixel_shuffle;
-use crate::nn::ops::sampling::{ImageSize, PixelPlaces, SAMPLED_TOGETHER, SampledImage};
+use crate::nn::ops::sampling::{ImageSize, PixelPlaces, SampledImage};
 use crate::vectorized::{vectorized, vectorized_by};
 
 /// Channels of the moved pixels that the fine layers read: a 2×2 block and the share inside the frame.

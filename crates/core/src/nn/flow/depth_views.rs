@@ -13,7 +13,8 @@ use super::blocks::centred;
 use super::encoder_views::EncoderViews;
 use crate::frame::warp::CameraModel;
 use crate::nn::geometry::camera::{Viewer, ViewerRays, rotated};
-use crate::nn::ops::sampling::{ImageSize, OfPlaces, SAMPLED_TOGETHER, SampledImage, read_together, write_together};
+use crate::nn::ops::gathering::{OfPlaces, SAMPLED_TOGETHER, read_together, write_together};
+use crate::nn::ops::sampling::{ImageSize, SampledImage};
 use crate::vectorized::vectorized_by;
 
 /// Distance of everything that the floor does not explain, before anything is learned.

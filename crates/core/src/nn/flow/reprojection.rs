@@ -10,7 +10,8 @@ use candle_core::{Result, Shape, Tensor, bail};
 use crate::frame::warp::MIN_DEPTH;
 use crate::nn::fused::{FusedOperation, Operand, apply};
 use crate::nn::geometry::camera::{Viewer, ViewerRays, rotated};
-use crate::nn::ops::sampling::{ImageSize, Neighbourhood, OfPlaces, SAMPLED_TOGETHER, SampledImage, write_together};
+use crate::nn::ops::gathering::{OfPlaces, SAMPLED_TOGETHER, write_together};
+use crate::nn::ops::sampling::{ImageSize, Neighbourhood, SampledImage};
 use crate::vectorized::{Instructions, vectorized_by};
 
 /// Values of a pixel: its place before the turn, its place before turn and drive (columns and rows), its depth in metres.

@@ -11,7 +11,8 @@ use candle_core::{Result, Shape, Tensor};
 use crate::frame::warp::CameraModel;
 use crate::nn::fused::{FusedOperation, Operand, apply};
 use crate::nn::geometry::camera::{CameraPose, Viewer, ViewerRays, rotated};
-use crate::nn::ops::sampling::{ImageSize, SAMPLED_TOGETHER};
+use crate::nn::ops::gathering::SAMPLED_TOGETHER;
+use crate::nn::ops::sampling::ImageSize;
 use crate::nn::tensors::with_values;
 use crate::vectorized::vectorized;
 

@@ -11,7 +11,8 @@ use candle_core::{Result, Shape, Tensor};
 
 use crate::frame::warp::{CameraModel, CameraView, MIN_DEPTH};
 use crate::nn::fused::{FusedOperation, Operand, apply};
-use crate::nn::ops::sampling::{ImageSize, OfPlaces, SAMPLED_TOGETHER};
+use crate::nn::ops::gathering::{OfPlaces, SAMPLED_TOGETHER};
+use crate::nn::ops::sampling::ImageSize;
 use crate::vectorized::vectorized;
 
 /// Where a camera stands on the floor and where it looks.

@@ -6,8 +6,8 @@
 use candle_core::{Result, Shape, Tensor, bail};
 
 use super::activation::exp;
-use super::gathering::of_pairs;
-use super::sampling::{ImageSize, Neighbourhood, PixelPlaces, SAMPLED_TOGETHER, SampledImage, write_together};
+use super::gathering::{SAMPLED_TOGETHER, of_pairs, write_together};
+use super::sampling::{ImageSize, Neighbourhood, PixelPlaces, SampledImage};
 use crate::nn::fused::{FusedOperation, Operand, apply};
 use crate::vectorized::{Instructions, vectorized, vectorized_by};
 

@@ -5,8 +5,13 @@
 #[cfg(target_arch = "x86_64")]
 mod x86;
 
-use super::sampling::{OfPlaces, SAMPLED_TOGETHER};
 use crate::vectorized::Instructions;
+
+/// Places that are sampled together, so that the arithmetic of all is a few vector instructions.
+pub(in crate::nn) const SAMPLED_TOGETHER: usize = 32;
+
+/// One number of each of some places.
+pub(in crate::nn) type OfPlaces = [f32; SAMPLED_TOGETHER];
 
 /// Pairs of neighbouring pixels.
 const PAIRS: usize = SAMPLED_TOGETHER / 2;
@@ -49,6 +54,28 @@ pub(super) fn of_pairs(pairs: &[[f32; 2 * PAIR_VALUES]; PAIRS], instructions: In
         }
     }
     values
+}
+
+/// The values of some neighbouring places from `first` on; zeros after the last place.
+#[inline(always)]
+pub(in crate::nn) fn read_together(values: &[f32], first: usize) -> OfPlaces {
+    let values = &values[first..];
+    if let Some(values) = values.first_chunk() {
+        return *values;
+    }
+    let mut filled = [0.0; SAMPLED_TOGETHER];
+    filled[..values.len()].copy_from_slice(values);
+    filled
+}
+
+/// Writes the values of some neighbouring places from `first` on; those beyond the last place are left out.
+#[inline(always)]
+pub(in crate::nn) fn write_together(values: &OfPlaces, out: &mut [f32], first: usize) {
+    let out = &mut out[first..];
+    match out.first_chunk_mut() {
+        Some(out) => *out = *values,
+        None => out.copy_from_slice(&values[..out.len()]),
+    }
 }
 
 #[cfg(test)]

@@ -4,7 +4,7 @@
 
 use candle_core::{Result, Shape, Tensor, bail};
 
-use super::gathering::corners;
+use super::gathering::{OfPlaces, SAMPLED_TOGETHER, corners, read_together};
 use crate::nn::fused::{FusedOperation, Operand, apply};
 use crate::vectorized::{Instructions, vectorized, whole};
 
@@ -18,12 +18,6 @@ pub(in crate::nn) struct Neighbourhood {
     /// Whether the place is not beyond the border in x, in y: only then does the value change with the place.
     pub(in crate::nn) moves: [bool; 2],
 }
-
-/// Places that are sampled together, so that the arithmetic of all is a few vector instructions.
-pub(in crate::nn) const SAMPLED_TOGETHER: usize = 32;
-
-/// One number of each of some places.
-pub(in crate::nn) type OfPlaces = [f32; SAMPLED_TOGETHER];
 
 /// Height and width of an image in pixels.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -187,28 +181,6 @@ impl Neighbourhood {
             if self.moves[0] { along } else { 0.0 },
             if self.moves[1] { down } else { 0.0 },
         ]
-    }
-}
-
-/// The values of some neighbouring places from `first` on; zeros after the last place.
-#[inline(always)]
-pub(in crate::nn) fn read_together(values: &[f32], first: usize) -> OfPlaces {
-    let values = &values[first..];
-    if let Some(values) = values.first_chunk() {
-        return *values;
-    }
-    let mut filled = [0.0; SAMPLED_TOGETHER];
-    filled[..values.len()].copy_from_slice(values);
-    filled
-}
-
-/// Writes the values of some neighbouring places from `first` on; those beyond the last place are left out.
-#[inline(always)]
-pub(in crate::nn) fn write_together(values: &OfPlaces, out: &mut [f32], first: usize) {
-    let out = &mut out[first..];
-    match out.first_chunk_mut() {
-        Some(out) => *out = *values,
-        None => out.copy_from_slice(&values[..out.len()]),
     }
 }
 

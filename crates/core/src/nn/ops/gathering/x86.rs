@@ -9,8 +9,7 @@ use std::arch::x86_64::{
     _mm512_setr_epi32, _mm512_setzero_ps, _mm512_setzero_si512,
 };
 
-use super::{PAIR_VALUES, PAIRS};
-use crate::nn::ops::sampling::{OfPlaces, SAMPLED_TOGETHER};
+use super::{OfPlaces, PAIR_VALUES, PAIRS, SAMPLED_TOGETHER};
 use crate::vectorized::Instructions;
 
 /// Numbers of a vector.
