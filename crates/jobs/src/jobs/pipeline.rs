@@ -130,7 +130,10 @@ impl Pipeline {
             datasets.extend(earlier.made_dataset().cloned());
             if let Some(model) = earlier.made_model() {
                 models.entry(model.clone()).or_default();
-                made.push(model.clone());
+                // Of the others, the active version is used.
+                if spec.after() == Some(id) {
+                    made.push(model.clone());
+                }
             }
         }
         let (data_dir, import_dir) = (objects.data_dir().to_owned(), self.resources.import_dir.clone());

@@ -21,7 +21,7 @@ use crate::nn::error::NnError;
 pub(in crate::nn) struct Asked {
     /// The frames of the first steps.
     pub(in crate::nn) steps: usize,
-    /// Neither the scene nor the movers of each frame.
+    /// Leaves out the scene and the movers of each frame.
     pub(in crate::nn) only_frames: bool,
 }
 

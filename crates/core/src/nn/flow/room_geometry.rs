@@ -109,7 +109,7 @@ pub(super) struct ViewInRoom {
     pub(super) pose: CameraPose,
     /// How far the camera is above the height from which the room was learned, in metres.
     pub(super) above: f32,
-    /// With as many rays in all views.
+    /// All views have the same number of rays.
     pub(super) camera: ViewerRays,
 }
 

@@ -92,8 +92,8 @@ impl Pipeline {
         Ok(with_version)
     }
 
-    /// A job as it is to be enqueued: all its parts use the version that is active now. It stays as it is without parts, and if a job
-    /// before it makes the model (`made`).
+    /// A job as it is to be enqueued: all its parts use the version that is active now. It stays as it is without parts, and if the
+    /// job that it waits for makes the model (`made`).
     pub(super) async fn with_version_of_parts(&self, spec: &JobSpec, made: &[ModelName]) -> Result<JobSpec, JobError> {
         match (spec.used_model(), spec.used_version()) {
             (Some(model), None) if !made.contains(model) && !spec.parts().is_empty() => {
@@ -144,7 +144,7 @@ impl Pipeline {
         memory.check(spec, base.as_ref(), self.store.objects()).await?;
         let Some(base) = base else { return Ok(()) };
         let info = self.described(&spec.dataset).await?;
-        // Computes with as many weights as the model has.
+        // On a blocking thread: it makes tensors as large as the model.
         let checked = tokio::task::spawn_blocking(move || check_start(&configs, &info, &base));
         checked.await.unwrap_or(Err(JobError::Stopping))
     }
