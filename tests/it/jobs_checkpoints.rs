@@ -1,20 +1,11 @@
 //! Damaged checkpoints of a training job.
 
-use foreframe::server::{App, ServerConfig};
+use foreframe::server::ServerConfig;
 use serde_json::{Value, json};
 
-use crate::service::{app, get, poll_until, post};
+use crate::service::{app, get, job_becomes, post};
 
 const JOBS: &str = "/v1/jobs";
-
-async fn becomes(app: &App, id: &str, has_come: impl Fn(&Value) -> bool) -> Value {
-    poll_until(async || {
-        let job = get(app, &format!("{JOBS}/{id}")).await.json();
-        assert!(job["state"] != "failed", "{job}");
-        has_come(&job).then_some(job)
-    })
-    .await
-}
 
 fn train() -> Value {
     let settings = json!({
@@ -33,16 +24,16 @@ async fn a_training_resumes_from_the_previous_checkpoint_if_the_latest_is_damage
     let app = app(dir.path(), ServerConfig::default());
     let seen = json!({"kind": "collect", "name": "seen", "scenario": "static-observer", "trials": 40});
     post(&app, JOBS, &seen).await;
-    becomes(&app, "job-1", |job| job["state"] == "succeeded").await;
+    job_becomes(&app, "job-1", |job| job["state"] == "succeeded").await;
     let run = dir.path().join("runs/job-2");
     post(&app, JOBS, &train()).await;
     for damage in [flip, truncate] {
-        becomes(&app, "job-2", |job| {
+        job_becomes(&app, "job-2", |job| {
             job["state"] == "running" && job["progress"]["done"].as_u64() > Some(8)
         })
         .await;
         post(&app, "/v1/jobs/job-2/cancel", &Value::Null).await;
-        becomes(&app, "job-2", |job| job["state"] == "cancelled").await;
+        job_becomes(&app, "job-2", |job| job["state"] == "cancelled").await;
         let path = run.join("checkpoint.safetensors");
         std::fs::write(&path, damage(std::fs::read(&path).unwrap())).unwrap();
         assert!(
@@ -52,7 +43,7 @@ async fn a_training_resumes_from_the_previous_checkpoint_if_the_latest_is_damage
                 .is_success()
         );
     }
-    becomes(&app, "job-2", |job| job["state"] == "succeeded").await;
+    job_becomes(&app, "job-2", |job| job["state"] == "succeeded").await;
     let log = get(&app, "/v1/jobs/job-2/logs").await.json();
     let lines: Vec<&str> = log["lines"]
         .as_array()

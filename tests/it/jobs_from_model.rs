@@ -13,7 +13,7 @@ use foreframe_train::training::{TrainConfig, check_start};
 use serde_json::{Value, json};
 
 use crate::jobs_end_to_end::{JOBS, collect_data_set, run_job, train, wait_for_version};
-use crate::service::{app, get, model, poll_until, post, send, spec, with_data};
+use crate::service::{app, get, job_becomes, model, poll_until, post, send, spec, with_data};
 
 #[tokio::test]
 async fn a_training_goes_on_from_a_model() {
@@ -115,15 +115,6 @@ async fn long_training_from_second_version(app: &App) -> Value {
         "settings": {"sequence": {"steps": 200}, "run": {"validate_every_steps": 50}}})
 }
 
-async fn becomes(app: &App, id: &str, has_come: impl Fn(&Value) -> bool) -> Value {
-    poll_until(async || {
-        let job = get(app, &format!("{JOBS}/{id}")).await.json();
-        assert!(job["state"] != "failed", "{job}");
-        has_come(&job).then_some(job)
-    })
-    .await
-}
-
 /// Resumes a training whose version to start from was deleted; with shared `objects`, on a machine that has nothing of it.
 async fn resume_without_the_version(objects: Option<String>) {
     let dir = tempfile::tempdir().unwrap();
@@ -137,9 +128,9 @@ async fn resume_without_the_version(objects: Option<String>) {
     let app = App::open(config).await.unwrap();
     let training = long_training_from_second_version(&app).await;
     assert_eq!(post(&app, JOBS, &training).await.status, 202);
-    becomes(&app, "job-4", |job| job["progress"]["done"].as_u64() > Some(8)).await;
+    job_becomes(&app, "job-4", |job| job["progress"]["done"].as_u64() > Some(8)).await;
     post(&app, "/v1/jobs/job-4/cancel", &Value::Null).await;
-    becomes(&app, "job-4", |job| job["state"] == "cancelled").await;
+    job_becomes(&app, "job-4", |job| job["state"] == "cancelled").await;
 
     let delete = Request::delete("/v1/models/fresh/versions/2")
         .body(Body::empty())
@@ -150,7 +141,7 @@ async fn resume_without_the_version(objects: Option<String>) {
         std::fs::remove_dir_all(dir.path().join("runs/job-4")).unwrap();
     }
     assert_eq!(post(&app, "/v1/jobs/job-4/resume", &Value::Null).await.status, 202);
-    becomes(&app, "job-4", |job| job["state"] == "succeeded").await;
+    job_becomes(&app, "job-4", |job| job["state"] == "succeeded").await;
     let log = get(&app, "/v1/jobs/job-4/logs").await.json().to_string();
     assert!(
         log.contains("sequence from step ") && !log.contains("sequence from step 0,"),
@@ -232,15 +223,15 @@ async fn an_evaluation_keeps_the_version_that_it_began_with() {
     long_training_from_second_version(&app).await;
     let evaluate = json!({"kind": "evaluate", "model": "fresh", "dataset": "seen", "windows": 40, "resamples": 10_000});
     assert_eq!(post(&app, JOBS, &evaluate).await.status, 202);
-    becomes(&app, "job-4", |job| job["spec"]["version"] == 1).await;
+    job_becomes(&app, "job-4", |job| job["spec"]["version"] == 1).await;
     post(&app, "/v1/jobs/job-4/cancel", &Value::Null).await;
-    let ended = becomes(&app, "job-4", |job| job["state"] != "running").await;
+    let ended = job_becomes(&app, "job-4", |job| job["state"] != "running").await;
     let activated = post(&app, "/v1/models/fresh/versions/2/activate", &Value::Null).await;
     assert_eq!(activated.json()["active_version"], 2);
     if ended["state"] == "cancelled" {
         assert_eq!(post(&app, "/v1/jobs/job-4/resume", &Value::Null).await.status, 202);
     }
-    let ended = becomes(&app, "job-4", |job| job["state"] == "succeeded").await;
+    let ended = job_becomes(&app, "job-4", |job| job["state"] == "succeeded").await;
     assert_eq!(ended["result"]["version"], 1, "{ended}");
 }
 

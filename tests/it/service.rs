@@ -221,3 +221,13 @@ pub(crate) async fn poll_until<T>(mut ask: impl AsyncFnMut() -> Option<T>) -> T 
         tokio::time::sleep(Duration::from_millis(5)).await;
     }
 }
+
+/// Waits until something has come true of a job. Panics if the job fails.
+pub(crate) async fn job_becomes(app: &App, id: &str, has_come: impl Fn(&Value) -> bool) -> Value {
+    poll_until(async || {
+        let job = get(app, &format!("/v1/jobs/{id}")).await.json();
+        assert!(job["state"] != "failed", "{job}");
+        has_come(&job).then_some(job)
+    })
+    .await
+}

@@ -148,10 +148,7 @@ impl Network {
         match &self.network {
             AnyNetwork::Dense(dense) => dense.predict_rollouts(codes, windows, conditioning),
             AnyNetwork::Flow(flow) => {
-                let asked = Asked {
-                    steps: self.spec.horizon,
-                    only_frames: true,
-                };
+                let asked = Asked::frames(self.spec.horizon);
                 Ok(flow.predict(codes, windows, conditioning, asked)?.frames)
             }
         }
@@ -191,10 +188,7 @@ impl Network {
         match &self.network {
             AnyNetwork::Dense(_) => Ok(None),
             AnyNetwork::Flow(flow) => {
-                let asked = Asked {
-                    steps,
-                    only_frames: false,
-                };
+                let asked = Asked::all(steps);
                 flow.predict(frames, &each_once(batch), conditioning, asked).map(Some)
             }
         }

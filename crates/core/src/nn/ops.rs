@@ -4,6 +4,8 @@ pub(super) mod activated_convolution;
 pub(super) mod activation;
 mod bordered_convolution;
 mod byte_convolution;
+#[cfg(target_arch = "x86_64")]
+mod casts;
 pub(super) mod compose;
 pub(super) mod convolution;
 pub(super) mod gathering;

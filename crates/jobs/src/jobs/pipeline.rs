@@ -117,7 +117,7 @@ impl Pipeline {
         let (mut datasets, mut models) = (datasets::names(objects).await?, self.versions.all().await?);
         let is_there = spec.datasets().into_iter().all(|name| datasets.contains(name));
         // What the jobs before it will make; each has a smaller number than the next.
-        let (mut after, mut made) = (spec.after(), Vec::new());
+        let (mut after, mut made) = (spec.after(), None);
         while let Some(id) = after {
             let row = self.store.job(id).await?;
             if row.is_none() && spec.after() == Some(id) {
@@ -132,7 +132,7 @@ impl Pipeline {
                 models.entry(model.clone()).or_default();
                 // Of the others, the active version is used.
                 if spec.after() == Some(id) {
-                    made.push(model.clone());
+                    made = Some(model.clone());
                 }
             }
         }
@@ -148,7 +148,7 @@ impl Pipeline {
             })
         });
         checked.await.unwrap_or(Err(JobError::Stopping))?;
-        let spec = self.with_version_of_parts(spec, &made).await?;
+        let spec = self.with_version_of_parts(spec, made.as_ref()).await?;
         match &spec {
             JobSpec::Train(spec) => self.check_training(spec, is_there).await?,
             // Which models fit is known when its data set is made.

@@ -219,8 +219,8 @@ impl JobSpec {
         spec
     }
 
-    /// Whether this can be the specification of a job that was submitted as `submitted`. A job that has started names the
-    /// version that it uses, so a request without one also matches a job that was submitted with one.
+    /// Whether this can be the specification of a job that was submitted as `submitted`. A job that has started or has parts names
+    /// the version that it uses, so a request without one also matches a job that was submitted with one.
     pub(super) fn matches_submitted(&self, submitted: &Self) -> bool {
         *self == submitted.with_used_version(submitted.used_version().or(self.used_version()))
     }

@@ -74,7 +74,7 @@ impl<'a> TrainingPlan<'a> {
         let train = kept;
         let frames = window_frames(&train, shape.context + shape.horizon);
         let spec = config.model_spec(dataset, &frames);
-        check_channels(&dataset.info().name, &spec)?;
+        check_conditioning(&dataset.info().name, &spec)?;
         check_actions(config, dataset, &spec)?;
         check_movers(config, dataset, &spec)?;
         spec.validate()?;
@@ -166,7 +166,7 @@ impl<'a> TrainingPlan<'a> {
 }
 
 /// Errors: `Config` if the model takes actions or states that the data set does not have.
-pub(super) fn check_channels(dataset: &str, spec: &ModelSpec) -> Result<(), TrainError> {
+pub(super) fn check_conditioning(dataset: &str, spec: &ModelSpec) -> Result<(), TrainError> {
     let (takes, has) = (
         [spec.action_inputs().is_some(), spec.state_inputs().is_some()],
         [!spec.actions.is_empty(), !spec.states.is_empty()],

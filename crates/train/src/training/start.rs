@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use candle_core::{Device, Tensor};
 
-use super::plan::check_channels as check_conditioning;
+use super::plan::check_conditioning;
 use super::{TrainConfig, TrainError};
 use foreframe_core::error_text::comma_separated;
 use foreframe_core::nn::{Architecture, ModelSpec, Parameters};

@@ -35,10 +35,6 @@ impl FlowNetwork {
         let mut context = frames.index_select(&Tensor::new(windows, frames.device())?, 0)?;
         let each: Vec<u32> = (0..count as u32).collect();
         let (mut parts, mut done) = (Vec::new(), 0);
-        let asked_of_part = Asked {
-            steps: spec.horizon,
-            only_frames: true,
-        };
         while done < steps {
             let taken = spec.horizon.min(steps - done);
             let part = actions_from(&actions, count, steps, done, spec);
@@ -48,7 +44,7 @@ impl FlowNetwork {
                 past_states: past_states.take(),
                 cameras: conditioning.cameras.clone(),
             };
-            let predicted = self.predict(&context, &each, &conditioning, asked_of_part)?;
+            let predicted = self.predict(&context, &each, &conditioning, Asked::frames(spec.horizon))?;
             parts.push(predicted.frames.narrow(1, 0, taken)?);
             done += taken;
             if done < steps {

@@ -20,9 +20,22 @@ use crate::nn::error::NnError;
 #[derive(Clone, Copy, Debug)]
 pub(in crate::nn) struct Asked {
     /// The frames of the first steps.
-    pub(in crate::nn) steps: usize,
-    /// Leaves out the scene and the movers of each frame.
-    pub(in crate::nn) only_frames: bool,
+    steps: usize,
+    only_frames: bool,
+}
+
+impl Asked {
+    /// All that the network gives.
+    pub(in crate::nn) fn all(steps: usize) -> Self {
+        let only_frames = false;
+        Self { steps, only_frames }
+    }
+
+    /// Without the scene and the movers of each frame.
+    pub(in crate::nn) fn frames(steps: usize) -> Self {
+        let only_frames = true;
+        Self { steps, only_frames }
+    }
 }
 
 impl FlowNetwork {

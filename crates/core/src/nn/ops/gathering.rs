@@ -26,8 +26,8 @@ pub(super) fn corners(
     [step_x, step_y]: [usize; 2],
     instructions: Instructions,
 ) -> [OfPlaces; 4] {
-    #[cfg(target_arch = "x86_64")]
     if instructions.have_avx512() && step_x == 1 {
+        #[cfg(target_arch = "x86_64")]
         return x86::corners(image, first, step_y, instructions);
     }
     let mut corners = [[0.0; SAMPLED_TOGETHER]; 4];
@@ -43,8 +43,8 @@ pub(super) fn corners(
 /// The values of pairs of pixels `[pixel, value]` each, by value.
 #[inline(always)]
 pub(super) fn of_pairs(pairs: &[[f32; 2 * PAIR_VALUES]; PAIRS], instructions: Instructions) -> [OfPlaces; PAIR_VALUES] {
-    #[cfg(target_arch = "x86_64")]
     if instructions.have_avx512() {
+        #[cfg(target_arch = "x86_64")]
         return x86::of_pairs(pairs, instructions);
     }
     let mut values = [[0.0; SAMPLED_TOGETHER]; PAIR_VALUES];

@@ -94,9 +94,13 @@ impl Pipeline {
 
     /// A job as it is to be enqueued: all its parts use the version that is active now. It stays as it is without parts, and if the
     /// job that it waits for makes the model (`made`).
-    pub(super) async fn with_version_of_parts(&self, spec: &JobSpec, made: &[ModelName]) -> Result<JobSpec, JobError> {
+    pub(super) async fn with_version_of_parts(
+        &self,
+        spec: &JobSpec,
+        made: Option<&ModelName>,
+    ) -> Result<JobSpec, JobError> {
         match (spec.used_model(), spec.used_version()) {
-            (Some(model), None) if !made.contains(model) && !spec.parts().is_empty() => {
+            (Some(model), None) if made != Some(model) && !spec.parts().is_empty() => {
                 Ok(spec.with_used_version(self.versions.active(model).await?))
             }
             _ => Ok(spec.clone()),

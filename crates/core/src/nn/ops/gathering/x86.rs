@@ -10,6 +10,7 @@ use std::arch::x86_64::{
 };
 
 use super::{OfPlaces, PAIR_VALUES, PAIRS, SAMPLED_TOGETHER};
+use crate::nn::ops::casts::casts;
 use crate::vectorized::Instructions;
 
 /// Numbers of a vector.
@@ -160,20 +161,6 @@ unsafe fn corners_within(image: &[f32], first: &[i32; LANES], below: usize) -> [
         values(_mm512_permutex2var_ps(lower[0], left, lower[1])),
         values(_mm512_permutex2var_ps(lower[0], right, lower[1])),
     ]
-}
-
-/// Functions that give the same bits another type.
-macro_rules! casts {
-    ($($name:ident: $from:ty => $to:ty;)*) => {
-        $(
-            #[inline(always)]
-            #[expect(unsafe_code, reason = "the standard library has no such conversion without pointers")]
-            fn $name(bits: $from) -> $to {
-                // SAFETY: both types have as many bits, and any bits are a value of each.
-                unsafe { std::mem::transmute::<$from, $to>(bits) }
-            }
-        )*
-    };
 }
 
 casts! {

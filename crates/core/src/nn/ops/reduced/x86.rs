@@ -9,6 +9,7 @@ use std::arch::x86_64::{
 };
 
 use super::{ByteRange, Group, LANES, MAX_VECTORS, PlaceGroups, ReducedPanel, ReducedProduct, Register};
+use crate::nn::ops::casts::casts;
 use crate::nn::ops::packed::StartSums;
 use crate::nn::precision::Precision;
 
@@ -72,20 +73,6 @@ fn extremes_of_vectors(values: &[f32]) -> (f32, f32) {
         .into_iter()
         .fold(_mm512_setzero_ps(), |most, vector| _mm512_max_ps(vector, most));
     (_mm512_reduce_min_ps(least), _mm512_reduce_max_ps(most))
-}
-
-/// Functions that give the same bits another type.
-macro_rules! casts {
-    ($($name:ident: $from:ty => $to:ty;)*) => {
-        $(
-            #[inline(always)]
-            #[expect(unsafe_code, reason = "the standard library has no such conversion without pointers")]
-            fn $name(bits: $from) -> $to {
-                // SAFETY: both types have 512 bits, and any bits are a value of each.
-                unsafe { std::mem::transmute::<$from, $to>(bits) }
-            }
-        )*
-    };
 }
 
 casts! {
