@@ -112,10 +112,10 @@ async fn long_training_from_second_version(app: &App) -> Value {
         assert_eq!(run_job(app, &train("fresh", 2)).await["result"]["version"], version);
     }
     json!({"kind": "train", "name": "further", "from": "fresh", "from_version": 2, "dataset": "seen",
-        "settings": {"sequence": {"steps": 200}, "run": {"validate_every_steps": 50}}})
+        "settings": {"sequence": {"steps": 200}, "run": {"validate_every_steps": 50, "checkpoint_every_steps": 100}}})
 }
 
-/// Resumes a training whose version to start from was deleted; with shared `objects`, on a machine that has nothing of it.
+/// Resumes a training whose version to start from was deleted before its first checkpoint; with shared `objects`, on a machine that has nothing of it.
 async fn resume_without_the_version(objects: Option<String>) {
     let dir = tempfile::tempdir().unwrap();
     let config = with_data(dir.path(), ServerConfig::default());
@@ -129,13 +129,12 @@ async fn resume_without_the_version(objects: Option<String>) {
     let training = long_training_from_second_version(&app).await;
     assert_eq!(post(&app, JOBS, &training).await.status, 202);
     job_becomes(&app, "job-4", |job| job["progress"]["done"].as_u64() > Some(8)).await;
-    post(&app, "/v1/jobs/job-4/cancel", &Value::Null).await;
-    job_becomes(&app, "job-4", |job| job["state"] == "cancelled").await;
-
     let delete = Request::delete("/v1/models/fresh/versions/2")
         .body(Body::empty())
         .unwrap();
     assert_eq!(send(&app, delete).await.status, 204);
+    post(&app, "/v1/jobs/job-4/cancel", &Value::Null).await;
+    job_becomes(&app, "job-4", |job| job["state"] == "cancelled").await;
     post(&app, JOBS, &training).await.detail(422);
     if is_shared {
         std::fs::remove_dir_all(dir.path().join("runs/job-4")).unwrap();
@@ -161,6 +160,20 @@ async fn a_training_goes_on_though_its_version_to_start_from_was_deleted() {
 async fn the_shared_store_has_the_version_to_start_from() {
     let objects = tempfile::tempdir().unwrap();
     resume_without_the_version(Some(objects.path().display().to_string())).await;
+}
+
+#[tokio::test]
+async fn a_training_after_an_evaluation_starts_from_the_active_version() {
+    let dir = tempfile::tempdir().unwrap();
+    let app = app(dir.path(), ServerConfig::default());
+    long_training_from_second_version(&app).await;
+    let evaluate = json!({"kind": "evaluate", "model": "fresh", "version": 2, "dataset": "seen", "windows": 40,
+        "resamples": 100});
+    assert_eq!(run_job(&app, &evaluate).await["result"]["version"], 2);
+    let further = json!({"kind": "train", "name": "further", "from": "fresh", "dataset": "seen", "after": "job-4",
+        "settings": {"sequence": {"steps": 2}}});
+    let trained = run_job(&app, &further).await;
+    assert_eq!(trained["spec"]["from_version"], 1, "{trained}");
 }
 
 #[tokio::test]
@@ -284,6 +297,10 @@ async fn a_model_that_does_not_fit_is_refused_at_once() {
     ] {
         let refused = post(&app, JOBS, &body).await.detail(422);
         assert!(refused.starts_with(start), "{refused}");
+        if body["kind"] == "train" {
+            let refused = post(&app, "/v1/jobs/estimate", &body).await.detail(422);
+            assert!(refused.starts_with(start), "{refused}");
+        }
     }
     for from in ["static", "paper", "moving", "static-flow", "moving-flow", "rooms"] {
         let taken = post(&app, JOBS, &further(from, json!({}))).await;

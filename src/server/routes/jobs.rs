@@ -13,7 +13,7 @@ use crate::server::http::page;
 use crate::server::http::problem::ApiError;
 use crate::server::state::App;
 use foreframe_jobs::jobs::memory::TrainingEstimate;
-use foreframe_jobs::jobs::pipeline::{base_manifest, report_key, run_key};
+use foreframe_jobs::jobs::pipeline::{estimate_training, report_key, run_key};
 use foreframe_jobs::jobs::{Job, JobError, JobFilter, JobSpec, JobState};
 use foreframe_jobs::store::{Author, JobId, LogRow, LossRow};
 use foreframe_train::training::SAMPLE_FILE;
@@ -142,8 +142,7 @@ async fn estimate(app: App, Json(spec): Json<JobSpec>) -> Result<axum::Json<Trai
         return Err(ApiError::Unprocessable(detail));
     };
     let memory = app.config().job_resources().memory;
-    let base = base_manifest(&spec, app.versions()).await?;
-    let estimate = memory.estimate(&spec, base.as_ref(), app.store().objects()).await?;
+    let estimate = estimate_training(&spec, memory, app.versions(), app.store().objects()).await?;
     Ok(axum::Json(estimate))
 }
 

@@ -48,7 +48,7 @@ impl JobMemory {
 
     /// What a training will need, without starting it; `base` is the model that it starts from, if it names one. Errors: `Invalid`,
     /// `NotFound`, and those of reading the data sets.
-    pub async fn estimate(
+    pub(super) async fn estimate(
         self,
         spec: &TrainSpec,
         base: Option<&Manifest>,

@@ -20,7 +20,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 use tokio::runtime::Handle;
 
-pub use self::base::base_manifest;
+pub use self::base::estimate_training;
 use super::executor::{JobExecutor, JobFailure, JobResult};
 use super::memory::JobMemory;
 use super::report::JobReporter;

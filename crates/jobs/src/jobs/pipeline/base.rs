@@ -5,11 +5,12 @@ use std::path::{Path, PathBuf};
 use serde_json::Value;
 
 use super::super::executor::JobFailure;
+use super::super::memory::{JobMemory, TrainingEstimate};
 use super::super::retry_policy::RetryPolicy;
 use super::super::spec::train::check_from;
-use super::super::{JobError, JobSpec, TrainSpec, datasets};
+use super::super::{Job, JobError, JobSpec, TrainSpec, datasets};
 use super::{Pipeline, failed, run_key};
-use crate::store::{JobId, StoreError};
+use crate::store::{JobId, Objects, StoreError};
 use crate::versions::{VersionError, Versions};
 use foreframe_core::error_kind::{ErrorKind, HasErrorKind as _};
 use foreframe_core::error_text;
@@ -32,8 +33,8 @@ pub(super) struct Base {
 }
 
 impl Pipeline {
-    /// Loads the model `from`. If its version was deleted since the job's last checkpoint, it is the copy in the job's run.
-    /// Errors: `Cancelled` if the lease is lost.
+    /// Loads the model `from`. If its version was deleted since the training began, it is the copy in the job's run. Errors:
+    /// `Cancelled` if the lease is lost.
     pub(super) fn base(&self, spec: &JobSpec, from: &ModelName, retry: &RetryPolicy<'_>) -> Result<Base, JobFailure> {
         let version = self.used_version(spec, from, retry)?;
         let kept = self.kept_start(retry);
@@ -66,10 +67,13 @@ impl Pipeline {
     }
 
     /// The version of a model that a job made, if it made one.
-    async fn made_version(&self, job: JobId, model: &ModelName) -> Result<Option<u32>, StoreError> {
-        let row = self.store.job(job).await?;
-        let outcome: Option<Value> = row.and_then(|row| serde_json::from_str(&row.outcome?).ok());
-        let made = outcome.filter(|outcome| outcome["model"] == model.as_str());
+    async fn made_version(&self, job: JobId, model: &ModelName) -> Result<Option<u32>, JobError> {
+        let Some(row) = self.store.job(job).await? else {
+            return Ok(None);
+        };
+        let makes_it = Job::of(&row)?.spec.made_model() == Some(model);
+        let outcome = row.outcome.filter(|_| makes_it);
+        let made: Option<Value> = outcome.and_then(|outcome| serde_json::from_str(&outcome).ok());
         Ok(made.and_then(|made| u32::try_from(made["version"].as_u64()?).ok()))
     }
 
@@ -107,7 +111,7 @@ impl Pipeline {
         }
     }
 
-    /// Keeps a copy of the model that a job starts from with the job's checkpoint, unless it was shipped and cannot be deleted.
+    /// Keeps a copy of the model that a job starts from in the job's run, unless it was shipped and cannot be deleted.
     pub(super) fn keep_start(&self, base: &Base, retry: &RetryPolicy<'_>) -> Result<(), StoreError> {
         let (kept, manifest) = (self.kept_start(retry), &base.weights.manifest);
         let is_shipped = self.versions.shipped(&manifest.name) == Some(manifest.version);
@@ -144,22 +148,22 @@ impl Pipeline {
         if !is_dataset_there {
             return Ok(());
         }
-        let memory = self.resources.memory;
-        memory.check(spec, base.as_ref(), self.store.objects()).await?;
-        let Some(base) = base else { return Ok(()) };
-        let info = self.described(&spec.dataset).await?;
-        // On a blocking thread: it makes tensors as large as the model.
-        let checked = tokio::task::spawn_blocking(move || check_start(&configs, &info, &base));
-        checked.await.unwrap_or(Err(JobError::Stopping))
+        let (memory, objects) = (self.resources.memory, self.store.objects());
+        memory.check(spec, base.as_ref(), objects).await?;
+        check_starts(configs, base, &spec.dataset, objects).await
     }
 
     /// Describes a data set, by the name that the caller knows.
     pub(super) async fn described(&self, name: &DatasetName) -> Result<DatasetInfo, JobError> {
-        Ok(DatasetInfo {
-            name: name.to_string(),
-            ..datasets::describe(self.store.objects(), name).await?
-        })
+        described(self.store.objects(), name).await
     }
+}
+
+async fn described(objects: &Objects, name: &DatasetName) -> Result<DatasetInfo, JobError> {
+    Ok(DatasetInfo {
+        name: name.to_string(),
+        ..datasets::describe(objects, name).await?
+    })
 }
 
 fn load_base(dir: &Path, name: &ModelName, version: u32) -> Result<StoredWeights, VersionError> {
@@ -174,6 +178,20 @@ fn load_base(dir: &Path, name: &ModelName, version: u32) -> Result<StoredWeights
     }
     weights.manifest.name.clone_from(name);
     Ok(weights)
+}
+
+/// Errors: `Invalid` if trainings cannot start from their base, if they have one.
+async fn check_starts(
+    configs: Vec<TrainConfig>,
+    base: Option<Manifest>,
+    dataset: &DatasetName,
+    objects: &Objects,
+) -> Result<(), JobError> {
+    let Some(base) = base else { return Ok(()) };
+    let info = described(objects, dataset).await?;
+    // On a blocking thread: it makes tensors as large as the model.
+    let checked = tokio::task::spawn_blocking(move || check_start(&configs, &info, &base));
+    checked.await.unwrap_or(Err(JobError::Stopping))
 }
 
 /// Errors: `Invalid` if trainings on a data set cannot start from a model.
@@ -194,9 +212,22 @@ pub(super) fn check_start(configs: &[TrainConfig], info: &DatasetInfo, base: &Ma
     Ok(())
 }
 
+/// What a training will need, without starting it. Errors: as when it is submitted; those of a store that is away.
+pub async fn estimate_training(
+    spec: &TrainSpec,
+    memory: JobMemory,
+    versions: &Versions,
+    objects: &Objects,
+) -> Result<TrainingEstimate, JobError> {
+    let base = base_manifest(spec, versions).await?;
+    let estimate = memory.estimate(spec, base.as_ref(), objects).await?;
+    check_starts(spec.configs(base.as_ref())?, base, &spec.dataset, objects).await?;
+    Ok(estimate)
+}
+
 /// The description of the model that a training starts from; `None` for new weights. Errors: `NotFound` and `Invalid`, which name the
 /// field; those of a store that is away.
-pub async fn base_manifest(spec: &TrainSpec, versions: &Versions) -> Result<Option<Manifest>, JobError> {
+async fn base_manifest(spec: &TrainSpec, versions: &Versions) -> Result<Option<Manifest>, JobError> {
     let Some(from) = &spec.from else { return Ok(None) };
     check_from(from, spec.from_version, spec.after, &versions.all().await?)?;
     match versions.manifest(from, spec.from_version).await {

@@ -13,7 +13,7 @@ use super::super::{JobSpec, TrainSpec};
 use super::base::Base;
 use super::training_report::TrainingReporter;
 use super::{Pipeline, failed, request_line, run_key};
-use crate::store::StoreError;
+use foreframe_core::error_text;
 use foreframe_core::registry::Manifest;
 use foreframe_core::types::ModelName;
 use foreframe_data::dataset::Dataset;
@@ -101,9 +101,21 @@ impl Pipeline {
         let mut sync = CheckpointSync::default();
         let mut observer = |event: TrainingEvent| {
             reporter.on_event(event);
-            if matches!(event, TrainingEvent::Checkpointed { .. }) {
-                let pushed = self.runtime.block_on(self.push_checkpoint(work.start, retry));
-                sync.record(pushed).into_iter().for_each(|line| report.line(line));
+            match (event, work.start) {
+                // The run's directory is there from here on.
+                (TrainingEvent::Started { .. }, Some(start)) => {
+                    if let Err(error) = self.keep_start(start, retry) {
+                        let reason = error_text::with_causes(&error);
+                        report.line(format!(
+                            "if the version that it starts from is deleted, it cannot be resumed: {reason}"
+                        ));
+                    }
+                }
+                (TrainingEvent::Checkpointed { .. }, _) => {
+                    let pushed = self.runtime.block_on(self.store.objects().push(&run, CHECKPOINT_FILE));
+                    sync.record(pushed).into_iter().for_each(|line| report.line(line));
+                }
+                _ => {}
             }
         };
         // After an error it continues from the last checkpoint.
@@ -128,15 +140,6 @@ impl Pipeline {
             }
             checkpoints::fetch_latest(objects, &run).await
         })
-    }
-
-    /// Copies a checkpoint to the object store, if there is a shared one, after what a later attempt needs besides it.
-    async fn push_checkpoint(&self, start: Option<&Base>, retry: &RetryPolicy<'_>) -> Result<(), StoreError> {
-        if let Some(start) = start {
-            self.keep_start(start, retry)?;
-        }
-        let run = run_key(retry.report.id());
-        self.store.objects().push(&run, CHECKPOINT_FILE).await
     }
 
     /// Publishes a trained model as the next version of that name.
