@@ -115,7 +115,8 @@ async fn long_training_from_second_version(app: &App) -> Value {
         "settings": {"sequence": {"steps": 200}, "run": {"validate_every_steps": 50, "checkpoint_every_steps": 100}}})
 }
 
-/// Resumes a training whose version to start from was deleted before its first checkpoint; with shared `objects`, on a machine that has nothing of it.
+/// Resumes a training whose version to start from was deleted before its first checkpoint; with shared `objects`, on a machine that has
+/// nothing of it.
 async fn resume_without_the_version(objects: Option<String>) {
     let dir = tempfile::tempdir().unwrap();
     let config = with_data(dir.path(), ServerConfig::default());

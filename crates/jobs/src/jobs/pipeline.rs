@@ -20,6 +20,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 use tokio::runtime::Handle;
 
+use self::base::described;
 pub use self::base::estimate_training;
 use super::executor::{JobExecutor, JobFailure, JobResult};
 use super::memory::JobMemory;
@@ -171,7 +172,7 @@ impl Pipeline {
 
     /// Errors: `Invalid` if a model that is there cannot run on the data set.
     async fn check_evaluation(&self, spec: &EvaluateSpec) -> Result<(), JobError> {
-        let info = self.described(&spec.dataset).await?;
+        let info = described(self.store.objects(), &spec.dataset).await?;
         let fits = async |name: &ModelName, version: Option<u32>| {
             // What cannot be read says so when the job runs.
             let Ok(manifest) = self.versions.manifest(name, version).await else {

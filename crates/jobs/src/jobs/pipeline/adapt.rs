@@ -7,7 +7,7 @@ use serde_json::json;
 use super::super::executor::{JobFailure, JobResult};
 use super::super::report::JobReporter;
 use super::super::{AdaptSpec, JobError, JobSpec};
-use super::base::check_start;
+use super::base::{check_starts, described};
 use super::train::TrainingWork;
 use super::{Pipeline, failed};
 use foreframe_core::error_kind::{ErrorKind, HasErrorKind as _};
@@ -72,7 +72,7 @@ impl Pipeline {
             // What cannot be read says so when the job runs.
             Err(_) => return Ok(()),
         };
-        let info = self.described(&spec.dataset).await?;
+        let info = described(self.store.objects(), &spec.dataset).await?;
         let config = spec.settings()?.training(&base, &info).map_err(|error| {
             let field = match error {
                 AdaptError::NotAdaptable(_) => "from",
@@ -84,7 +84,6 @@ impl Pipeline {
             JobError::invalid(field, error_text::with_causes(&error))
         })?;
         self.resources.memory.check_training(&config, &info)?;
-        let checked = tokio::task::spawn_blocking(move || check_start(&[config], &info, &base));
-        checked.await.unwrap_or(Err(JobError::Stopping))
+        check_starts(vec![config], Some(base), info).await
     }
 }

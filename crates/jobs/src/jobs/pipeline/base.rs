@@ -150,16 +150,12 @@ impl Pipeline {
         }
         let (memory, objects) = (self.resources.memory, self.store.objects());
         memory.check(spec, base.as_ref(), objects).await?;
-        check_starts(configs, base, &spec.dataset, objects).await
-    }
-
-    /// Describes a data set, by the name that the caller knows.
-    pub(super) async fn described(&self, name: &DatasetName) -> Result<DatasetInfo, JobError> {
-        described(self.store.objects(), name).await
+        check_starts(configs, base, described(objects, &spec.dataset).await?).await
     }
 }
 
-async fn described(objects: &Objects, name: &DatasetName) -> Result<DatasetInfo, JobError> {
+/// Describes a data set, by the name that the caller knows.
+pub(super) async fn described(objects: &Objects, name: &DatasetName) -> Result<DatasetInfo, JobError> {
     Ok(DatasetInfo {
         name: name.to_string(),
         ..datasets::describe(objects, name).await?
@@ -180,22 +176,19 @@ fn load_base(dir: &Path, name: &ModelName, version: u32) -> Result<StoredWeights
     Ok(weights)
 }
 
-/// Errors: `Invalid` if trainings cannot start from their base, if they have one.
-async fn check_starts(
+/// Errors: `Invalid` if trainings on a data set cannot start from their base, if they have one.
+pub(super) async fn check_starts(
     configs: Vec<TrainConfig>,
     base: Option<Manifest>,
-    dataset: &DatasetName,
-    objects: &Objects,
+    info: DatasetInfo,
 ) -> Result<(), JobError> {
     let Some(base) = base else { return Ok(()) };
-    let info = described(objects, dataset).await?;
     // On a blocking thread: it makes tensors as large as the model.
-    let checked = tokio::task::spawn_blocking(move || check_start(&configs, &info, &base));
+    let checked = tokio::task::spawn_blocking(move || check_each_start(&configs, &info, &base));
     checked.await.unwrap_or(Err(JobError::Stopping))
 }
 
-/// Errors: `Invalid` if trainings on a data set cannot start from a model.
-pub(super) fn check_start(configs: &[TrainConfig], info: &DatasetInfo, base: &Manifest) -> Result<(), JobError> {
+fn check_each_start(configs: &[TrainConfig], info: &DatasetInfo, base: &Manifest) -> Result<(), JobError> {
     for (at, config) in configs.iter().enumerate() {
         // Most trainings of a sweep have the same network.
         if configs[..at].iter().any(|earlier| earlier.model == config.model) {
@@ -221,7 +214,8 @@ pub async fn estimate_training(
 ) -> Result<TrainingEstimate, JobError> {
     let base = base_manifest(spec, versions).await?;
     let estimate = memory.estimate(spec, base.as_ref(), objects).await?;
-    check_starts(spec.configs(base.as_ref())?, base, &spec.dataset, objects).await?;
+    let info = described(objects, &spec.dataset).await?;
+    check_starts(spec.configs(base.as_ref())?, base, info).await?;
     Ok(estimate)
 }
 
