@@ -138,7 +138,10 @@ impl RunningServer {
         let line = &program.line;
         let address = line.split("http://").nth(1).and_then(|rest| rest.split('/').next());
         let server = Self {
-            address: address.unwrap_or_else(|| panic!("{line}")).parse().unwrap(),
+            address: address
+                .unwrap_or_else(|| panic!("{line}{}", std::fs::read_to_string(&program.log).unwrap()))
+                .parse()
+                .unwrap(),
             program,
             key: None,
         };
