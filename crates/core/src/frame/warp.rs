@@ -117,6 +117,7 @@ impl CameraView {
 
     /// The ray through the middle of a pixel; 1 long along the camera's axis.
     #[must_use]
+    #[inline]
     pub fn ray(&self, column: usize, row: usize) -> [f32; 3] {
         let right = (column as f32 + 0.5 - self.middle_column) * self.pixel_size;
         let down = (row as f32 + 0.5 - self.middle_row) * self.pixel_size;
@@ -143,6 +144,7 @@ impl CameraView {
 
     /// The place [column, row] of a point. One beside or behind the camera lies far outside the frame.
     #[must_use]
+    #[inline]
     pub fn project(&self, point: [f32; 3]) -> [f32; 2] {
         let [depth, down] = self.depth_and_down(point);
         let scale = depth.max(MIN_DEPTH) * self.pixel_size;

@@ -6,9 +6,6 @@
 
 use pulp::{Arch, Simd, WithSimd};
 
-/// Most vectors of outputs whose sums are kept in registers together.
-const MAX_VECTORS: usize = 3;
-
 /// The weights `[inputs, outputs]` of a layer, and its bias, in vectors as wide as this machine's.
 #[derive(Debug)]
 pub(in crate::nn) struct PackedWeights {
@@ -61,9 +58,9 @@ pub(in crate::nn) enum StartSums {
 impl PackedWeights {
     /// Packs weights `[inputs, outputs]` and a bias `[outputs]`.
     pub(in crate::nn) fn new(weights: &[f32], bias: &[f32]) -> Self {
-        let (lanes, outputs) = (lanes(), bias.len());
+        let (Registers { lanes, vectors: most }, outputs) = (registers(), bias.len());
         let vectors = outputs.div_ceil(lanes);
-        let panels = vectors.div_ceil(MAX_VECTORS);
+        let panels = vectors.div_ceil(most);
         let panel = |index: usize| {
             // As equal as possible.
             let [from, to] = [index, index + 1].map(|index| index * vectors / panels);
@@ -119,18 +116,38 @@ impl PackedWeights {
 
 /// How many f32 a vector of this machine holds.
 pub(super) fn lanes() -> usize {
-    Arch::new().dispatch(Lanes)
+    registers().lanes
 }
 
-struct Lanes;
+/// The registers of this machine.
+struct Registers {
+    lanes: usize,
+    /// Most vectors of outputs whose sums are kept in registers together.
+    vectors: usize,
+}
 
-impl WithSimd for Lanes {
-    type Output = usize;
+fn registers() -> Registers {
+    Arch::new().dispatch(AskRegisters)
+}
+
+struct AskRegisters;
+
+impl WithSimd for AskRegisters {
+    type Output = Registers;
 
     #[inline(always)]
-    fn with_simd<S: Simd>(self, _: S) -> usize {
-        S::F32_LANES
+    fn with_simd<S: Simd>(self, _: S) -> Registers {
+        Registers {
+            lanes: S::F32_LANES,
+            vectors: if has_many::<S>() { 3 } else { 2 },
+        }
     }
+}
+
+/// Whether there are more than the 16 vector registers of processors with AVX2.
+#[inline(always)]
+fn has_many<S: Simd>() -> bool {
+    S::REGISTER_COUNT > 16
 }
 
 struct Product<'a> {
@@ -149,7 +166,7 @@ impl WithSimd for Product<'_> {
             match panel.vectors {
                 1 => self.panel::<S, 1>(simd, panel),
                 2 => self.panel::<S, 2>(simd, panel),
-                _ => self.panel::<S, MAX_VECTORS>(simd, panel),
+                _ => self.panel::<S, 3>(simd, panel),
             }
         }
     }
@@ -159,10 +176,18 @@ impl Product<'_> {
     #[inline(always)]
     fn panel<S: Simd, const VECTORS: usize>(&mut self, simd: S, panel: &OutputPanel) {
         let (mut place, places) = (0, self.out.len() / self.weights.outputs);
-        // Sums, weights and one input fit the registers.
-        while S::REGISTER_COUNT > 16 && place + 8 <= places {
+        // Sums, weights and one input fit the registers. With all of 16 registers in use, the compiler would move sums to memory and back.
+        while has_many::<S>() && place + 8 <= places {
             self.block::<S, 8, VECTORS>(simd, panel, place);
             place += 8;
+        }
+        while !has_many::<S>() && VECTORS == 1 && place + 12 <= places {
+            self.block::<S, 12, VECTORS>(simd, panel, place);
+            place += 12;
+        }
+        while !has_many::<S>() && place + 6 <= places {
+            self.block::<S, 6, VECTORS>(simd, panel, place);
+            place += 6;
         }
         while place + 4 <= places {
             self.block::<S, 4, VECTORS>(simd, panel, place);
@@ -206,6 +231,10 @@ impl Product<'_> {
             let inputs: [&[f32]; PLACES] =
                 std::array::from_fn(|at| &values[(place + at) * step + run.offset..][..weights.len()]);
             sums = with_products(simd, sums, inputs, weights);
+            if !has_many::<S>() {
+                // In memory between the runs. Otherwise the compiler would leave some there also within them.
+                sums = std::hint::black_box(sums);
+            }
         }
         for (at, sums) in sums.iter().enumerate() {
             for (vector, sum) in sums.iter().enumerate() {
@@ -225,11 +254,11 @@ fn with_products<S: Simd, const PLACES: usize, const VECTORS: usize>(
 ) -> [[S::f32s; VECTORS]; PLACES] {
     // A slice of the loop's length needs no check in the loop, which would keep the sums out of the registers.
     let inputs = inputs.map(|inputs| &inputs[..weights.len()]);
-    for (input, weights) in weights.iter().enumerate() {
+    for input in 0..weights.len() {
         for at in 0..PLACES {
             let value = simd.splat_f32s(inputs[at][input]);
             for vector in 0..VECTORS {
-                sums[at][vector] = simd.mul_add_e_f32s(value, weights[vector], sums[at][vector]);
+                sums[at][vector] = simd.mul_add_e_f32s(value, weights[input][vector], sums[at][vector]);
             }
         }
     }

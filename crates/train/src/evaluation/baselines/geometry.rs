@@ -13,7 +13,7 @@ use rayon::prelude::*;
 
 use self::floor_view::FloorView;
 use self::odometry::PoseChannels;
-use super::commanded_motion::CommandedMotion;
+use super::commanded_motion::{CommandedMotion, ORIGIN};
 use super::input::BaselineInput;
 use crate::evaluation::EvaluationError;
 use crate::evaluation::windows::{evenly, true_frame};
@@ -124,10 +124,13 @@ impl Geometry {
 
     /// The last frame as the camera sees it at each predicted frame, for a wall at these distances in its columns.
     fn warp(&self, view: &FloorView, input: &BaselineInput, last: &[f32], walls_m: &[f32]) -> Vec<Vec<f32>> {
-        let poses = self.motion.poses(input).into_iter();
-        poses
-            .map(|pose| sample(last, self.width, self.height, &view.places_in_last(pose, walls_m)).0)
-            .collect()
+        let seen_at = |pose| {
+            if pose == ORIGIN {
+                return last.to_vec();
+            }
+            sample(last, self.width, self.height, &view.places_in_last(pose, walls_m)).0
+        };
+        self.motion.poses(input).into_iter().map(seen_at).collect()
     }
 
     /// The sum of the steps' errors in a window, for each distance of the wall.

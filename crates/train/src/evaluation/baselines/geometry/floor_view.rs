@@ -20,16 +20,20 @@ pub(super) struct FloorView {
     camera_height_m: f32,
     width: usize,
     height: usize,
+    /// The ray of each pixel, row by row.
+    rays: Vec<[f32; 3]>,
 }
 
 impl FloorView {
     /// None where the camera's height is not known. `width` and `height` are those of the frames.
     pub(super) fn new(camera: CameraModel, width: usize, height: usize) -> Option<Self> {
+        let (camera_height_m, view) = (camera.height_m?, CameraView::new(camera, width, height));
         Some(Self {
-            view: CameraView::new(camera, width, height),
-            camera_height_m: camera.height_m?,
+            view,
+            camera_height_m,
             width,
             height,
+            rays: view.rays(width, height).collect(),
         })
     }
 
@@ -47,7 +51,7 @@ impl FloorView {
     /// column of the last frame.
     pub(super) fn places_in_last(&self, pose: PlanarPose, walls_m: &[f32]) -> Vec<[f32; 2]> {
         let (sin, cos) = pose.heading_rad.sin_cos();
-        let place = |[ahead, left, up]: [f32; 3]| {
+        let place = |&[ahead, left, up]: &[f32; 3]| {
             let ray = [cos * ahead - sin * left, sin * ahead + cos * left, up];
             let mut place = self.view.project(ray);
             let mut column = self.column_of(place);
@@ -61,23 +65,18 @@ impl FloorView {
             }
             place
         };
-        self.rays().map(place).collect()
+        self.rays.iter().map(place).collect()
     }
 
     /// For each pixel of the last frame, its place in the frame of a camera at `pose`, for a wall at one distance.
     pub(super) fn places_at(&self, pose: PlanarPose, wall_m: f32) -> Vec<[f32; 2]> {
         let (sin, cos) = pose.heading_rad.sin_cos();
-        let place = |ray: [f32; 3]| {
-            let [x, y, up] = self.end(ORIGIN, ray, wall_m);
+        let place = |ray: &[f32; 3]| {
+            let [x, y, up] = self.end(ORIGIN, *ray, wall_m);
             let (x, y) = (x - pose.x_m, y - pose.y_m);
             self.view.project([cos * x + sin * y, cos * y - sin * x, up])
         };
-        self.rays().map(place).collect()
-    }
-
-    /// The ray of each pixel, row by row.
-    fn rays(&self) -> impl Iterator<Item = [f32; 3]> + '_ {
-        self.view.rays(self.width, self.height)
+        self.rays.iter().map(place).collect()
     }
 
     fn column_of(&self, [column, _]: [f32; 2]) -> usize {
@@ -130,7 +129,7 @@ mod tests {
     /// A smooth picture of the floor and the wall, as a camera at `pose` sees it.
     fn picture(pose: PlanarPose) -> Vec<f32> {
         let (view, (sin, cos)) = (view(), pose.heading_rad.sin_cos());
-        let seen = view.rays().map(|[x, y, up]| {
+        let seen = view.rays.iter().map(|&[x, y, up]| {
             let [x, y, z] = view.end(pose, [cos * x - sin * y, sin * x + cos * y, up], WALL_M);
             0.5 + 0.2 * (3.0 * x).sin() + 0.2 * (4.0 * y + z).cos()
         });

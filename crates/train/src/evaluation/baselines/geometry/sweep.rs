@@ -6,6 +6,7 @@ use foreframe_sim::PlanarPose;
 
 use super::floor_view::FloorView;
 use super::{WALL_RATIO, WALLS, walls_m as candidates_m};
+use crate::evaluation::baselines::commanded_motion::ORIGIN;
 
 /// A larger difference between two frames counts as this large, so that movers and what is hidden count little.
 const MAX_DIFFERENCE: f32 = 0.1;
@@ -41,9 +42,11 @@ pub(super) fn walls_m(view: &FloorView, last: &[f32], earlier: &[EarlierFrame], 
 /// The mean difference to the earlier frames in each column, for each distance.
 fn costs(view: &FloorView, last: &[f32], earlier: &[EarlierFrame]) -> Vec<ColumnCosts> {
     let mut costs = vec![[0.0; WALLS]; view.width()];
+    // A frame from the same place differs by as much for every distance.
+    let elsewhere: Vec<&EarlierFrame> = earlier.iter().filter(|frame| frame.pose != ORIGIN).collect();
     for (wall, wall_m) in candidates_m().into_iter().enumerate() {
         let mut sums = vec![0.0; view.width()];
-        for frame in earlier {
+        for frame in &elsewhere {
             let places = view.places_at(frame.pose, wall_m);
             let (seen, inside) = sample(frame.values, view.width(), view.height(), &places);
             let pixels = seen.iter().zip(&inside).zip(last);
