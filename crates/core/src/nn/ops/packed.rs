@@ -228,8 +228,11 @@ impl Product<'_> {
         let PlaceInputs { values, step, runs } = self.inputs;
         for run in runs {
             let weights = &weights[run.first..][..run.length];
-            let inputs: [&[f32]; PLACES] =
-                std::array::from_fn(|at| &values[(place + at) * step + run.offset..][..weights.len()]);
+            // Slices of the loop's length need no check in the loop. A closure for each place would stay a call.
+            let mut inputs: [&[f32]; PLACES] = [&[]; PLACES];
+            for (at, inputs) in inputs.iter_mut().enumerate() {
+                *inputs = &values[(place + at) * step + run.offset..][..weights.len()];
+            }
             sums = with_products(simd, sums, inputs, weights);
             if !has_many::<S>() {
                 // In memory between the runs. Otherwise the compiler would leave some there also within them.
@@ -252,13 +255,11 @@ fn with_products<S: Simd, const PLACES: usize, const VECTORS: usize>(
     inputs: [&[f32]; PLACES],
     weights: &[[S::f32s; VECTORS]],
 ) -> [[S::f32s; VECTORS]; PLACES] {
-    // A slice of the loop's length needs no check in the loop, which would keep the sums out of the registers.
-    let inputs = inputs.map(|inputs| &inputs[..weights.len()]);
-    for input in 0..weights.len() {
+    for (input, weights) in weights.iter().enumerate() {
         for at in 0..PLACES {
             let value = simd.splat_f32s(inputs[at][input]);
             for vector in 0..VECTORS {
-                sums[at][vector] = simd.mul_add_e_f32s(value, weights[input][vector], sums[at][vector]);
+                sums[at][vector] = simd.mul_add_e_f32s(value, weights[vector], sums[at][vector]);
             }
         }
     }
