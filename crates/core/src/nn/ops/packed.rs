@@ -4,12 +4,7 @@
 // A closure's vector instructions reach what is inlined into it, and only that.
 #![allow(clippy::inline_always)]
 
-use std::ops::Range;
-
 use pulp::{Arch, Simd, WithSimd};
-
-/// Panels whose sums are computed together where there is only one place.
-const PANELS_TOGETHER: usize = 4;
 
 /// The weights `[inputs, outputs]` of a layer, and its bias, in vectors as wide as this machine's.
 #[derive(Debug)]
@@ -167,26 +162,12 @@ impl WithSimd for Product<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(mut self, simd: S) {
-        let mut panels = &self.weights.panels[..];
-        let is_row = self.out.len() == self.weights.outputs;
-        while let [panel, others @ ..] = panels {
-            let together = panels.first_chunk::<PANELS_TOGETHER>();
-            let together = together.filter(|all| is_row && all.iter().all(|one| one.vectors == panel.vectors));
-            if let Some(together) = together {
-                match panel.vectors {
-                    1 => self.row::<S, 1>(simd, together),
-                    2 => self.row::<S, 2>(simd, together),
-                    _ => self.row::<S, 3>(simd, together),
-                }
-                panels = &panels[PANELS_TOGETHER..];
-                continue;
-            }
+        for panel in &self.weights.panels {
             match panel.vectors {
                 1 => self.panel::<S, 1>(simd, panel),
                 2 => self.panel::<S, 2>(simd, panel),
                 _ => self.panel::<S, 3>(simd, panel),
             }
-            panels = others;
         }
     }
 }
@@ -226,10 +207,23 @@ impl Product<'_> {
         panel: &OutputPanel,
         place: usize,
     ) {
+        let outputs = self.weights.outputs;
         let weights = S::as_simd_f32s(&panel.weights).0.as_chunks::<VECTORS>().0;
+        let (bias, _) = S::as_simd_f32s(&panel.bias);
+        // The part of the output that a vector of sums goes to.
+        let part = |at: usize, vector: usize| {
+            let first = panel.first + vector * S::F32_LANES;
+            let from = (place + at) * outputs + first;
+            from..from + S::F32_LANES.min(outputs - first)
+        };
         let mut sums = [[simd.splat_f32s(0.0); VECTORS]; PLACES];
         for (at, sums) in sums.iter_mut().enumerate() {
-            *sums = self.start(simd, panel, place + at);
+            for (vector, sum) in sums.iter_mut().enumerate() {
+                *sum = bias[vector];
+                if self.start == StartSums::Output {
+                    *sum = simd.add_f32s(*sum, load(simd, &self.out[part(at, vector)]));
+                }
+            }
         }
         let PlaceInputs { values, step, runs } = self.inputs;
         for run in runs {
@@ -241,75 +235,15 @@ impl Product<'_> {
             }
             sums = with_products(simd, sums, inputs, weights);
             if !has_many::<S>() {
-                // In memory between the runs. Otherwise the compiler would leave some there also within them.
+                // Puts the sums in memory between the runs. Otherwise the compiler would leave some there within them too.
                 sums = std::hint::black_box(sums);
             }
         }
         for (at, sums) in sums.iter().enumerate() {
-            self.finish(simd, panel, place + at, sums);
-        }
-    }
-
-    /// The sums of several panels' outputs at the only place. So few sums as those of one panel would wait for each other.
-    #[inline(always)]
-    fn row<S: Simd, const VECTORS: usize>(&mut self, simd: S, panels: &[OutputPanel; PANELS_TOGETHER]) {
-        let mut sums = [[simd.splat_f32s(0.0); VECTORS]; PANELS_TOGETHER];
-        for (panel, sums) in panels.iter().zip(&mut sums) {
-            *sums = self.start(simd, panel, 0);
-        }
-        let PlaceInputs { values, runs, .. } = self.inputs;
-        for run in runs {
-            let inputs = &values[run.offset..][..run.length];
-            let mut weights: [&[[S::f32s; VECTORS]]; PANELS_TOGETHER] = [&[]; PANELS_TOGETHER];
-            for (panel, weights) in panels.iter().zip(&mut weights) {
-                let all = S::as_simd_f32s(&panel.weights).0.as_chunks::<VECTORS>().0;
-                *weights = &all[run.first..][..inputs.len()];
-            }
-            for (input, value) in inputs.iter().enumerate() {
-                let value = simd.splat_f32s(*value);
-                for panel in 0..PANELS_TOGETHER {
-                    for vector in 0..VECTORS {
-                        sums[panel][vector] =
-                            simd.mul_add_e_f32s(value, weights[panel][input][vector], sums[panel][vector]);
-                    }
-                }
+            for (vector, sum) in sums.iter().enumerate() {
+                store(simd, &mut self.out[part(at, vector)], *sum);
             }
         }
-        for (panel, sums) in panels.iter().zip(&sums) {
-            self.finish(simd, panel, 0, sums);
-        }
-    }
-
-    /// What a panel's sums at a place start from.
-    #[inline(always)]
-    fn start<S: Simd, const VECTORS: usize>(&self, simd: S, panel: &OutputPanel, place: usize) -> [S::f32s; VECTORS] {
-        let (bias, _) = S::as_simd_f32s(&panel.bias);
-        let mut sums = [simd.splat_f32s(0.0); VECTORS];
-        for (vector, sum) in sums.iter_mut().enumerate() {
-            *sum = bias[vector];
-            if self.start == StartSums::Output {
-                *sum = simd.add_f32s(*sum, load(simd, &self.out[self.part::<S>(panel, place, vector)]));
-            }
-        }
-        sums
-    }
-
-    /// Writes a panel's sums at a place.
-    #[inline(always)]
-    fn finish<S: Simd>(&mut self, simd: S, panel: &OutputPanel, place: usize, sums: &[S::f32s]) {
-        for (vector, sum) in sums.iter().enumerate() {
-            let part = self.part::<S>(panel, place, vector);
-            store(simd, &mut self.out[part], *sum);
-        }
-    }
-
-    /// The part of the output that a vector of a panel's sums goes to.
-    #[inline(always)]
-    fn part<S: Simd>(&self, panel: &OutputPanel, place: usize, vector: usize) -> Range<usize> {
-        let outputs = self.weights.outputs;
-        let first = panel.first + vector * S::F32_LANES;
-        let from = place * outputs + first;
-        from..from + S::F32_LANES.min(outputs - first)
     }
 }
 

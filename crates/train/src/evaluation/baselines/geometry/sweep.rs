@@ -39,10 +39,10 @@ pub(super) fn walls_m(view: &FloorView, last: &[f32], earlier: &[EarlierFrame], 
     cheapest_path(&costs).into_iter().map(|wall| candidates[wall]).collect()
 }
 
-/// The mean difference to the earlier frames in each column, for each distance.
+/// The mean difference to the earlier frames in each column, for each distance, without what is the same for all distances.
 fn costs(view: &FloorView, last: &[f32], earlier: &[EarlierFrame]) -> Vec<ColumnCosts> {
     let mut costs = vec![[0.0; WALLS]; view.width()];
-    // A frame from the same place differs by as much for every distance.
+    // From the same place, a frame shows the same for every distance.
     let elsewhere: Vec<&EarlierFrame> = earlier.iter().filter(|frame| frame.pose != ORIGIN).collect();
     for (wall, wall_m) in candidates_m().into_iter().enumerate() {
         let mut sums = vec![0.0; view.width()];
