@@ -4,7 +4,7 @@ pub(super) mod activated_convolution;
 pub(super) mod activation;
 mod bordered_convolution;
 mod byte_convolution;
-#[cfg(target_arch = "x86_64")]
+#[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
 mod casts;
 pub(super) mod compose;
 pub(super) mod convolution;

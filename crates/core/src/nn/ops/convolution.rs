@@ -31,7 +31,9 @@ impl Convolution3 {
     pub(in crate::nn) fn pack(&mut self, precision: Precision) -> Result<()> {
         let stride = self.shape.stride;
         let packed = with_values(&self.weight, |weights| {
-            with_values(&self.bias, |bias| PackedKernel::new(weights, bias, stride, precision))
+            with_values(&self.bias, |bias| {
+                PackedKernel::new(weights, bias, stride, precision.of_convolutions())
+            })
         })??;
         self.packed = Some(Arc::new(packed));
         Ok(())

@@ -7,8 +7,14 @@
 // A closure's vector instructions reach what is inlined into it, and only that.
 #![allow(clippy::inline_always)]
 
+#[cfg(target_arch = "aarch64")]
+mod arm;
 #[cfg(target_arch = "x86_64")]
-mod x86;
+mod avx2;
+#[cfg(target_arch = "x86_64")]
+mod avx512;
+#[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
+mod products;
 
 use super::packed::{StartSums, TapRun};
 use super::scratch::with_groups;
@@ -17,10 +23,6 @@ use crate::vectorized::vectorized;
 
 /// Outputs whose sums are computed together.
 const LANES: usize = 16;
-/// Most vectors of outputs whose sums are kept in registers together.
-const MAX_VECTORS: usize = 3;
-/// The largest byte of a weight.
-const MOST_OF_WEIGHT: f32 = 127.0;
 /// The largest byte of an input.
 const MOST_OF_INPUT: f32 = 255.0;
 
@@ -87,7 +89,7 @@ impl ReducedWeights {
     pub(super) fn new(weights: &[f32], bias: &[f32], run: usize, precision: Precision) -> Self {
         let outputs = bias.len();
         let vectors = outputs.div_ceil(LANES);
-        let panels = vectors.div_ceil(MAX_VECTORS);
+        let panels = vectors.div_ceil(most_vectors(precision));
         let panel = |index: usize| {
             // As equal as possible.
             let [from, to] = [index, index + 1].map(|index| index * vectors / panels);
@@ -113,8 +115,14 @@ impl ReducedWeights {
             start,
         };
         #[cfg(target_arch = "x86_64")]
-        x86::multiply(product);
-        #[cfg(not(target_arch = "x86_64"))]
+        if avx512::multiplies(self.precision) {
+            avx512::multiply(product);
+        } else {
+            avx2::multiply(product);
+        }
+        #[cfg(target_arch = "aarch64")]
+        arm::multiply(product);
+        #[cfg(not(any(target_arch = "x86_64", target_arch = "aarch64")))]
         unreachable!("{} weights on this processor are a bug", product.weights.precision);
     }
 
@@ -172,7 +180,7 @@ impl ReducedPanel {
         };
         let factors = of_outputs(&|output| {
             let largest = (0..inputs).fold(0.0f32, |most, input| most.max(weight(input, output).abs()));
-            if largest > 0.0 { largest / MOST_OF_WEIGHT } else { 1.0 }
+            if largest > 0.0 { largest / most_of_weight() } else { 1.0 }
         });
         let mut weight_sums = vec![Register([0; LANES]); to - from];
         let mut packed = Vec::new();
@@ -259,12 +267,47 @@ impl ByteRange {
 
 /// The least and the largest of the values and of 0.
 fn extremes(values: &[f32]) -> (f32, f32) {
+    /// Values that are compared at once: some vectors, so that none waits for the one before.
+    const TOGETHER: usize = 4 * LANES;
     #[cfg(target_arch = "x86_64")]
-    if Precision::Int8.is_supported() {
-        return x86::extremes(values);
+    if avx512::multiplies(Precision::Int8) {
+        return avx512::extremes(values);
     }
-    let widened = |(least, most): (f32, f32), &value: &f32| (least.min(value), most.max(value));
-    values.iter().fold((0.0, 0.0), widened)
+    vectorized(
+        #[inline(always)]
+        || {
+            let (vectors, rest) = values.as_chunks::<TOGETHER>();
+            let mut least = [0.0; TOGETHER];
+            let mut most = least;
+            for vector in vectors {
+                for at in 0..TOGETHER {
+                    // One instruction each: `min` and `max` take more, for NaN.
+                    least[at] = if vector[at] < least[at] { vector[at] } else { least[at] };
+                    most[at] = if vector[at] > most[at] { vector[at] } else { most[at] };
+                }
+            }
+            let widened = |(least, most): (f32, f32), &value: &f32| (least.min(value), most.max(value));
+            rest.iter().chain(&least).chain(&most).fold((0.0, 0.0), widened)
+        },
+    )
+}
+
+/// Most vectors of outputs whose sums are kept in registers together.
+fn most_vectors(precision: Precision) -> usize {
+    match precision {
+        #[cfg(target_arch = "x86_64")]
+        precision if avx512::multiplies(precision) => avx512::MOST_VECTORS,
+        _ => 1,
+    }
+}
+
+/// The largest byte of a weight on this processor.
+fn most_of_weight() -> f32 {
+    #[cfg(target_arch = "x86_64")]
+    if !avx512::multiplies(Precision::Int8) {
+        return avx2::MOST_OF_WEIGHT;
+    }
+    127.0
 }
 
 /// Inputs of a group.
@@ -375,7 +418,7 @@ mod tests {
     }
 
     fn of_weight_bytes(column: &[f32]) -> Vec<f32> {
-        let factor = column.iter().fold(0.0f32, |most, weight| most.max(weight.abs())) / MOST_OF_WEIGHT;
+        let factor = column.iter().fold(0.0f32, |most, weight| most.max(weight.abs())) / most_of_weight();
         column.iter().map(|weight| (weight / factor).round() * factor).collect()
     }
 

@@ -1,0 +1,98 @@
+//! The products on 64-bit ARM processors with instructions for sums of products of bytes.
+// A function's vector instructions reach what is inlined into it, and only that.
+#![allow(clippy::inline_always)]
+
+use std::arch::aarch64::{
+    float32x4_t, int32x4_t, vaddq_f32, vcvtq_f32_s32, vdupq_n_f32, vdupq_n_s32, veorq_s32, vmlsq_s32, vmulq_f32,
+};
+use std::arch::asm;
+
+use super::products::products;
+use super::{ByteRange, Group, LANES, PlaceGroups, ReducedPanel, ReducedProduct, Register};
+use crate::nn::ops::casts::casts;
+use crate::nn::precision::Precision;
+
+/// Registers of a vector of outputs, four in each.
+const QUARTERS: usize = LANES / 4;
+/// Inputs are bytes without a sign, and the instruction takes bytes with one. This turns byte b of a group into b − 128.
+const SIGNS: i32 = i32::from_ne_bytes([0x80; 4]);
+const SHIFT: i32 = 128;
+
+casts! {
+    group_bits: Register<Group> => [int32x4_t; QUARTERS];
+    whole_bits: Register<i32> => [int32x4_t; QUARTERS];
+    float_bits: Register<f32> => [float32x4_t; QUARTERS];
+    floats: [float32x4_t; QUARTERS] => Register<f32>;
+}
+
+/// Computes a product of bytes.
+#[expect(
+    unsafe_code,
+    reason = "only the processor can tell whether it has the instructions, and it is asked first"
+)]
+pub(super) fn multiply(product: ReducedProduct) {
+    let precision = product.weights.precision;
+    assert!(
+        precision == Precision::Int8 && precision.is_supported(),
+        "weights in {precision} on this processor are a bug"
+    );
+    // SAFETY: `is_supported` found the features of this function.
+    unsafe { multiply_bytes(product) }
+}
+
+products!(
+    fn multiply_bytes, "neon,dotprod", places { 1: 6, 3; }
+    sums [vdupq_n_s32(0); QUARTERS], weights group_bits, group of_all, add add_products, finish finish
+);
+
+/// The same group for all outputs, as bytes with a sign.
+#[target_feature(enable = "neon,dotprod")]
+#[inline]
+fn of_all(group: Group) -> int32x4_t {
+    veorq_s32(vdupq_n_s32(SIGNS), vdupq_n_s32(i32::from_le_bytes(group)))
+}
+
+/// Adds to each sum four products.
+#[target_feature(enable = "neon,dotprod")]
+#[inline]
+#[expect(unsafe_code, reason = "the standard library does not offer the instruction yet")]
+fn add_products(
+    mut sums: [int32x4_t; QUARTERS],
+    group: int32x4_t,
+    weights: [int32x4_t; QUARTERS],
+) -> [int32x4_t; QUARTERS] {
+    for at in 0..QUARTERS {
+        // SAFETY: this function has the feature of the instruction, which reads and writes only these registers.
+        unsafe {
+            asm!(
+                "sdot {sums:v}.4s, {weights:v}.16b, {group:v}.16b",
+                sums = inout(vreg) sums[at],
+                weights = in(vreg) weights[at],
+                group = in(vreg) group,
+                options(pure, nomem, nostack, preserves_flags)
+            );
+        }
+    }
+    sums
+}
+
+/// What sums of products of shifted bytes stand for, with the bias.
+#[target_feature(enable = "neon,dotprod")]
+#[inline]
+fn finish(
+    mut sums: [int32x4_t; QUARTERS],
+    range: Option<ByteRange>,
+    panel: &ReducedPanel,
+    vector: usize,
+) -> Register<f32> {
+    let ByteRange { scale, zero } = range.unwrap_or_default();
+    let zero = vdupq_n_s32(i32::from(zero) - SHIFT);
+    let weight_sums = whole_bits(panel.weight_sums[vector]);
+    let [mut values, bias] = [panel.factors[vector], panel.bias[vector]].map(float_bits);
+    for at in 0..QUARTERS {
+        sums[at] = vmlsq_s32(sums[at], zero, weight_sums[at]);
+        let factor = vmulq_f32(vdupq_n_f32(scale), values[at]);
+        values[at] = vaddq_f32(vmulq_f32(vcvtq_f32_s32(sums[at]), factor), bias[at]);
+    }
+    floats(values)
+}

@@ -1,0 +1,80 @@
+//! The products of bytes on x86-64 processors without AVX-512. Two products are added up in 16 bits before they become a sum of 32:
+//! so weights have 7 bits, whose sums of two always fit.
+// A function's vector instructions reach what is inlined into it, and only that.
+#![allow(clippy::inline_always)]
+
+use std::arch::x86_64::{
+    __m256, __m256i, _mm256_add_epi32, _mm256_add_ps, _mm256_cvtepi32_ps, _mm256_madd_epi16, _mm256_maddubs_epi16,
+    _mm256_mul_ps, _mm256_mullo_epi32, _mm256_set1_epi16, _mm256_set1_epi32, _mm256_set1_ps, _mm256_setzero_si256,
+    _mm256_sub_epi32,
+};
+
+use super::products::products;
+use super::{ByteRange, Group, PlaceGroups, ReducedPanel, ReducedProduct, Register};
+use crate::nn::ops::casts::casts;
+use crate::nn::precision::Precision;
+
+/// The largest byte of a weight: 2 · 255 · 63 fits 16 bits.
+pub(super) const MOST_OF_WEIGHT: f32 = 63.0;
+
+casts! {
+    group_bits: Register<Group> => [__m256i; 2];
+    whole_bits: Register<i32> => [__m256i; 2];
+    float_bits: Register<f32> => [__m256; 2];
+    floats: [__m256; 2] => Register<f32>;
+}
+
+/// Computes a product of bytes.
+#[expect(
+    unsafe_code,
+    reason = "only the processor can tell whether it has the instructions, and it is asked first"
+)]
+pub(super) fn multiply(product: ReducedProduct) {
+    let precision = product.weights.precision;
+    assert!(
+        precision == Precision::Int8 && precision.is_supported(),
+        "weights in {precision} on this processor are a bug"
+    );
+    // SAFETY: `is_supported` found AVX2.
+    unsafe { multiply_bytes(product) }
+}
+
+products!(
+    fn multiply_bytes, "avx2", places { 1: 4, 2; }
+    sums [_mm256_setzero_si256(); 2], weights group_bits, group of_all, add add_products, finish finish
+);
+
+/// The same group for all outputs.
+#[target_feature(enable = "avx2")]
+#[inline]
+fn of_all(group: Group) -> __m256i {
+    _mm256_set1_epi32(i32::from_le_bytes(group))
+}
+
+/// Adds to each sum four products.
+#[target_feature(enable = "avx2")]
+#[inline]
+fn add_products(mut sums: [__m256i; 2], group: __m256i, weights: [__m256i; 2]) -> [__m256i; 2] {
+    for half in 0..2 {
+        let of_two = _mm256_maddubs_epi16(group, weights[half]);
+        let of_four = _mm256_madd_epi16(of_two, _mm256_set1_epi16(1));
+        sums[half] = _mm256_add_epi32(sums[half], of_four);
+    }
+    sums
+}
+
+/// What sums of products of bytes stand for, with the bias.
+#[target_feature(enable = "avx2")]
+#[inline]
+fn finish(sums: [__m256i; 2], range: Option<ByteRange>, panel: &ReducedPanel, vector: usize) -> Register<f32> {
+    let ByteRange { scale, zero } = range.unwrap_or_default();
+    let weight_sums = whole_bits(panel.weight_sums[vector]);
+    let [mut values, bias] = [panel.factors[vector], panel.bias[vector]].map(float_bits);
+    for half in 0..2 {
+        let of_zeros = _mm256_mullo_epi32(_mm256_set1_epi32(zero.into()), weight_sums[half]);
+        let factor = _mm256_mul_ps(_mm256_set1_ps(scale), values[half]);
+        let sum = _mm256_cvtepi32_ps(_mm256_sub_epi32(sums[half], of_zeros));
+        values[half] = _mm256_add_ps(_mm256_mul_ps(sum, factor), bias[half]);
+    }
+    floats(values)
+}

@@ -1,0 +1,117 @@
+//! The loops of a product, the same for each kind of instructions.
+// A function's vector instructions reach what is inlined into it, and only that.
+#![allow(clippy::inline_always)]
+
+use super::{ByteRange, LANES, PlaceGroups, ReducedPanel, ReducedProduct, Register};
+use crate::nn::ops::packed::StartSums;
+
+/// A function that computes a product with instructions of its own. The sums of some vectors of outputs at some places stay in registers
+/// while the inputs and weights pass by: for each number of vectors, at so many places, then at fewer, then at one after the other.
+macro_rules! products {
+    (
+        fn $name:ident, $features:literal, places { $($vectors:literal: $places:literal, $fewer:literal;)* }
+        sums $no_sum:expr, weights $weights:path, group $group:path, add $add:path, finish $finish:path
+    ) => {
+        #[target_feature(enable = $features)]
+        fn $name(mut product: ReducedProduct) {
+            #[target_feature(enable = $features)]
+            fn panel<const PLACES: usize, const FEWER: usize, const VECTORS: usize>(
+                product: &mut ReducedProduct,
+                panel: &ReducedPanel,
+            ) {
+                let (mut place, places) = (0, product.out.len() / product.weights.outputs);
+                while place + PLACES <= places {
+                    block::<PLACES, VECTORS>(product, panel, place);
+                    place += PLACES;
+                }
+                while place + FEWER <= places {
+                    block::<FEWER, VECTORS>(product, panel, place);
+                    place += FEWER;
+                }
+                while place < places {
+                    block::<1, VECTORS>(product, panel, place);
+                    place += 1;
+                }
+            }
+
+            #[target_feature(enable = $features)]
+            #[inline]
+            fn block<const PLACES: usize, const VECTORS: usize>(
+                product: &mut ReducedProduct,
+                panel: &ReducedPanel,
+                place: usize,
+            ) {
+                let PlaceGroups {
+                    groups, step, runs, ..
+                } = product.inputs;
+                let weights = panel.weights.as_chunks::<VECTORS>().0;
+                let mut sums = [[$no_sum; VECTORS]; PLACES];
+                for run in runs {
+                    let weights = &weights[run.first..][..run.length];
+                    // A slice of the loop's length needs no check in the loop, which would keep the sums out of the registers.
+                    let mut inputs: [&[Group]; PLACES] = [&[]; PLACES];
+                    for (at, inputs) in inputs.iter_mut().enumerate() {
+                        *inputs = &groups[(place + at) * step + run.offset..][..weights.len()];
+                    }
+                    for (input, weights) in weights.iter().enumerate() {
+                        for at in 0..PLACES {
+                            let group = $group(inputs[at][input]);
+                            for vector in 0..VECTORS {
+                                sums[at][vector] = $add(sums[at][vector], group, $weights(weights[vector]));
+                            }
+                        }
+                    }
+                }
+                for (at, sums) in sums.into_iter().enumerate() {
+                    for (vector, sums) in sums.into_iter().enumerate() {
+                        let values = $finish(sums, product.inputs.range(place + at), panel, vector);
+                        product.store(panel, [place + at, vector], values);
+                    }
+                }
+            }
+
+            for outputs in &product.weights.panels {
+                match outputs.vectors {
+                    $($vectors => panel::<$places, $fewer, $vectors>(&mut product, outputs),)*
+                    others => unreachable!("{others} vectors of outputs are a bug"),
+                }
+            }
+        }
+    };
+}
+
+pub(super) use products;
+
+impl PlaceGroups<'_> {
+    /// What the bytes of a place stand for.
+    #[inline(always)]
+    pub(super) fn range(&self, place: usize) -> Option<ByteRange> {
+        match self.ranges {
+            [all] => Some(*all),
+            ranges => ranges.get(place).copied(),
+        }
+    }
+}
+
+impl ReducedProduct<'_> {
+    /// Writes the sums of a vector of outputs at a place.
+    #[inline(always)]
+    pub(super) fn store(&mut self, panel: &ReducedPanel, [place, vector]: [usize; 2], Register(sums): Register<f32>) {
+        let outputs = self.weights.outputs;
+        let first = panel.first + vector * LANES;
+        let out = &mut self.out[place * outputs + first..][..LANES.min(outputs - first)];
+        let held = |at: usize, out: &[f32]| if self.start == StartSums::Output { out[at] } else { 0.0 };
+        match out.as_mut_array::<LANES>() {
+            Some(out) => {
+                for at in 0..LANES {
+                    out[at] = sums[at] + held(at, out);
+                }
+            }
+            None => {
+                for at in 0..out.len() {
+                    out[at] = sums[at] + held(at, out);
+                }
+            }
+        }
+    }
+}
