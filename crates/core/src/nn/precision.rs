@@ -22,7 +22,8 @@ pub enum Precision {
     F32,
     /// bfloat16: 16 bits, of which 8 are the exponent.
     Bf16,
-    /// Whole numbers of 8 bits with factors: one for each output of the weights, and one for each item of the inputs.
+    /// Whole numbers of 8 bits with factors: one for each output of the weights, and one for each item of the inputs. With AVX2, weights
+    /// have 7 bits.
     Int8,
 }
 
@@ -31,7 +32,8 @@ impl Precision {
     pub const ALL: [Self; 3] = [Self::F32, Self::Bf16, Self::Int8];
 
     /// Whether this processor multiplies such numbers. For bf16 and int8 it must have instructions for it: without them, these would be
-    /// slower than single precision.
+    /// slower than single precision. With AVX2 and without AVX-512 VNNI, int8 is for dense networks only: flow networks stay in single
+    /// precision.
     #[must_use]
     pub fn is_supported(self) -> bool {
         match self {
@@ -57,8 +59,8 @@ impl Precision {
         }
     }
 
-    /// The precision of convolutions. In single precision, tiles of places take fewer products; only instructions for four bytes at
-    /// once are still faster.
+    /// The precision of convolutions. They stay in single precision unless one instruction adds up four products of bytes: tiles of
+    /// places save more than AVX2's bytes.
     pub(super) fn of_convolutions(self) -> Self {
         match self {
             Self::Int8 if !multiplies_four_bytes() => Self::F32,
@@ -128,7 +130,7 @@ impl From<Precision> for String {
     }
 }
 
-/// Whether one instruction of this processor adds up four products of bytes. AVX2 adds up two, of smaller bytes.
+/// Whether one instruction of this processor adds up four products of bytes: AVX-512 VNNI, or ARM's dot products. AVX-VNNI is not used.
 pub(super) fn multiplies_four_bytes() -> bool {
     #[cfg(target_arch = "x86_64")]
     return is_x86_feature_detected!("avx512f") && is_x86_feature_detected!("avx512vnni");

@@ -13,8 +13,13 @@ mod arm;
 mod avx2;
 #[cfg(target_arch = "x86_64")]
 mod avx512;
+mod bytes;
+mod instructions;
 #[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
 mod products;
+
+pub(super) use bytes::ByteRange;
+use instructions::ReducedInstructions;
 
 use super::packed::{StartSums, TapRun};
 use super::scratch::with_groups;
@@ -23,9 +28,6 @@ use crate::vectorized::vectorized;
 
 /// Outputs whose sums are computed together.
 const LANES: usize = 16;
-/// The largest byte of an input.
-const MOST_OF_INPUT: f32 = 255.0;
-
 /// Neighbouring inputs of a place.
 pub(super) type Group = [u8; 4];
 
@@ -39,6 +41,7 @@ struct Register<T>([T; LANES]);
 pub(in crate::nn) struct ReducedWeights {
     outputs: usize,
     precision: Precision,
+    instructions: ReducedInstructions,
     panels: Vec<ReducedPanel>,
 }
 
@@ -69,13 +72,6 @@ pub(super) struct PlaceGroups<'a> {
     pub(super) ranges: &'a [ByteRange],
 }
 
-/// Which numbers bytes stand for.
-#[derive(Clone, Copy, Debug, Default)]
-pub(super) struct ByteRange {
-    pub(super) scale: f32,
-    pub(super) zero: u8,
-}
-
 /// What one call computes.
 struct ReducedProduct<'a> {
     weights: &'a ReducedWeights,
@@ -85,45 +81,46 @@ struct ReducedProduct<'a> {
 }
 
 impl ReducedWeights {
-    /// Packs weights `[inputs, outputs]` and a bias `[outputs]`. The inputs are runs of that many, each filled up to whole groups.
+    /// Packs weights `[inputs, outputs]` and a bias `[outputs]`. The inputs are runs of that many, each filled up to whole groups. A
+    /// processor without instructions for the precision is a bug.
     pub(super) fn new(weights: &[f32], bias: &[f32], run: usize, precision: Precision) -> Self {
+        let instructions = ReducedInstructions::all(precision);
+        let fastest = instructions
+            .first()
+            .expect("weights of an unsupported precision are a bug");
+        Self::with(*fastest, precision, [weights, bias], run)
+    }
+
+    fn with(instructions: ReducedInstructions, precision: Precision, [weights, bias]: [&[f32]; 2], run: usize) -> Self {
         let outputs = bias.len();
         let vectors = outputs.div_ceil(LANES);
-        let panels = vectors.div_ceil(most_vectors(precision));
-        let panel = |index: usize| {
-            // As equal as possible.
-            let [from, to] = [index, index + 1].map(|index| index * vectors / panels);
-            ReducedPanel::new(weights, bias, [from, to], run, precision)
-        };
-        Self {
+        let panels = vectors.div_ceil(instructions.most_vectors());
+        let mut packed = Self {
             outputs,
             precision,
-            panels: (0..panels).map(panel).collect(),
+            instructions,
+            panels: Vec::new(),
+        };
+        for index in 0..panels {
+            // As equal as possible.
+            let vectors = [index, index + 1].map(|index| index * vectors / panels);
+            packed.panels.push(packed.panel([weights, bias], vectors, run));
         }
+        packed
     }
 
     pub(super) fn outputs(&self) -> usize {
         self.outputs
     }
 
-    /// Writes the sums of each place to `out` `[places, outputs]`. A processor without the instructions is a bug.
+    /// Writes the sums of each place to `out` `[places, outputs]`.
     pub(super) fn multiply(&self, inputs: PlaceGroups, out: &mut [f32], start: StartSums) {
-        let product = ReducedProduct {
+        self.instructions.multiply(ReducedProduct {
             weights: self,
             inputs,
             out,
             start,
-        };
-        #[cfg(target_arch = "x86_64")]
-        if avx512::multiplies(self.precision) {
-            avx512::multiply(product);
-        } else {
-            avx2::multiply(product);
-        }
-        #[cfg(target_arch = "aarch64")]
-        arm::multiply(product);
-        #[cfg(not(any(target_arch = "x86_64", target_arch = "aarch64")))]
-        unreachable!("{} weights on this processor are a bug", product.weights.precision);
+        });
     }
 
     /// The sums of rows `[rows, inputs]` without neighbours.
@@ -162,9 +159,10 @@ impl ReducedWeights {
     }
 }
 
-impl ReducedPanel {
-    fn new(weights: &[f32], bias: &[f32], [from, to]: [usize; 2], run: usize, precision: Precision) -> Self {
-        let outputs = bias.len();
+impl ReducedWeights {
+    /// The weights and the bias of the vectors `from..to` of outputs.
+    fn panel(&self, [weights, bias]: [&[f32]; 2], [from, to]: [usize; 2], run: usize) -> ReducedPanel {
+        let (outputs, precision) = (self.outputs, self.precision);
         let weight = |input: usize, output: usize| {
             let row = weights.chunks_exact(outputs).nth(input);
             row.and_then(|row| row.get(output)).copied().unwrap_or(0.0)
@@ -180,7 +178,11 @@ impl ReducedPanel {
         };
         let factors = of_outputs(&|output| {
             let largest = (0..inputs).fold(0.0f32, |most, input| most.max(weight(input, output).abs()));
-            if largest > 0.0 { largest / most_of_weight() } else { 1.0 }
+            if largest > 0.0 {
+                largest / self.instructions.most_of_weight()
+            } else {
+                1.0
+            }
         });
         let mut weight_sums = vec![Register([0; LANES]); to - from];
         let mut packed = Vec::new();
@@ -210,7 +212,7 @@ impl ReducedPanel {
                 }
             }
         }
-        Self {
+        ReducedPanel {
             first: from * LANES,
             vectors: to - from,
             weights: packed,
@@ -219,95 +221,6 @@ impl ReducedPanel {
             bias: of_outputs(&|output| bias.get(output).copied().unwrap_or(0.0)),
         }
     }
-}
-
-impl ByteRange {
-    /// That of these values and of 0.
-    pub(super) fn of(values: &[f32]) -> Self {
-        let (least, most) = extremes(values);
-        let scale = (most - least) / MOST_OF_INPUT;
-        if scale.is_normal() {
-            let zero = (-least / scale).round() as u8;
-            Self { scale, zero }
-        } else {
-            Self { scale: 1.0, zero: 0 }
-        }
-    }
-
-    /// Writes places `[places, channels]` as bytes; the last group of each is filled up with what stands for 0.
-    pub(super) fn write(self, values: &[f32], channels: usize, groups: &mut [Group]) {
-        let length = channels.div_ceil(inputs_of_group(Precision::Int8)) * size_of::<Group>();
-        let to = groups.as_flattened_mut();
-        vectorized(
-            #[inline(always)]
-            || {
-                if length == channels {
-                    return self.write_bytes(values, to);
-                }
-                for (values, to) in values.chunks_exact(channels).zip(to.chunks_exact_mut(length)) {
-                    let (to, rest) = to.split_at_mut(channels);
-                    self.write_bytes(values, to);
-                    rest.fill(self.zero);
-                }
-            },
-        );
-    }
-
-    #[inline(always)]
-    fn write_bytes(self, values: &[f32], to: &mut [u8]) {
-        /// After adding 2^23, the low bits hold the nearest whole number.
-        const ROUND: f32 = 8_388_608.0;
-        let (factor, first) = (self.scale.recip(), ROUND + f32::from(self.zero));
-        for (to, value) in to.iter_mut().zip(values) {
-            let shifted = (value * factor + first).clamp(ROUND, ROUND + MOST_OF_INPUT);
-            *to = shifted.to_bits() as u8;
-        }
-    }
-}
-
-/// The least and the largest of the values and of 0.
-fn extremes(values: &[f32]) -> (f32, f32) {
-    /// Values that are compared at once: some vectors, so that none waits for the one before.
-    const TOGETHER: usize = 4 * LANES;
-    #[cfg(target_arch = "x86_64")]
-    if avx512::multiplies(Precision::Int8) {
-        return avx512::extremes(values);
-    }
-    vectorized(
-        #[inline(always)]
-        || {
-            let (vectors, rest) = values.as_chunks::<TOGETHER>();
-            let mut least = [0.0; TOGETHER];
-            let mut most = least;
-            for vector in vectors {
-                for at in 0..TOGETHER {
-                    // One instruction each: `min` and `max` take more, for NaN.
-                    least[at] = if vector[at] < least[at] { vector[at] } else { least[at] };
-                    most[at] = if vector[at] > most[at] { vector[at] } else { most[at] };
-                }
-            }
-            let widened = |(least, most): (f32, f32), &value: &f32| (least.min(value), most.max(value));
-            rest.iter().chain(&least).chain(&most).fold((0.0, 0.0), widened)
-        },
-    )
-}
-
-/// Most vectors of outputs whose sums are kept in registers together.
-fn most_vectors(precision: Precision) -> usize {
-    match precision {
-        #[cfg(target_arch = "x86_64")]
-        precision if avx512::multiplies(precision) => avx512::MOST_VECTORS,
-        _ => 1,
-    }
-}
-
-/// The largest byte of a weight on this processor.
-fn most_of_weight() -> f32 {
-    #[cfg(target_arch = "x86_64")]
-    if !avx512::multiplies(Precision::Int8) {
-        return avx2::MOST_OF_WEIGHT;
-    }
-    127.0
 }
 
 /// Inputs of a group.
@@ -372,8 +285,14 @@ mod tests {
         for precision in [Precision::Bf16, Precision::Int8] {
             if !precision.is_supported() {
                 eprintln!("skipped: this processor does not multiply {precision}");
-                continue;
             }
+            let all = ReducedInstructions::all(precision).into_iter();
+            all.for_each(|instructions| check_products(precision, instructions));
+        }
+    }
+
+    fn check_products(precision: Precision, instructions: ReducedInstructions) {
+        {
             for (rows, inputs, outputs) in [
                 (1, 3, 1),
                 (13, 20, 12),
@@ -388,19 +307,23 @@ mod tests {
                     values(outputs, 3),
                 );
                 let mut out = vec![7.0; rows * outputs];
-                ReducedWeights::new(&weights, &bias, inputs, precision).multiply_rows(&x, &mut out);
+                let packed = ReducedWeights::with(instructions, precision, [&weights, &bias], inputs);
+                packed.multiply_rows(&x, &mut out);
                 for (index, found) in out.iter().enumerate() {
                     let (row, output) = (index / outputs, index % outputs);
                     let row = &x[row * inputs..(row + 1) * inputs];
                     let column: Vec<f32> = (0..inputs).map(|input| weights[input * outputs + output]).collect();
                     let (row, column) = match precision {
-                        Precision::Int8 => (of_bytes(row), of_weight_bytes(&column)),
+                        Precision::Int8 => (of_bytes(row), of_weight_bytes(&column, instructions.most_of_weight())),
                         _ => [row, &column]
                             .map(|values| values.iter().map(|value| half(*value)).collect())
                             .into(),
                     };
                     let expected = bias[output] + row.iter().zip(&column).map(|(x, w)| x * w).sum::<f32>();
-                    assert!((found - expected).abs() < 2e-5, "{precision}: {found} {expected}");
+                    assert!(
+                        (found - expected).abs() < 2e-5,
+                        "{instructions:?}, {precision}: {found} {expected}"
+                    );
                 }
             }
         }
@@ -417,9 +340,27 @@ mod tests {
             .collect()
     }
 
-    fn of_weight_bytes(column: &[f32]) -> Vec<f32> {
-        let factor = column.iter().fold(0.0f32, |most, weight| most.max(weight.abs())) / most_of_weight();
+    fn of_weight_bytes(column: &[f32], most: f32) -> Vec<f32> {
+        let factor = column.iter().fold(0.0f32, |most, weight| most.max(weight.abs())) / most;
         column.iter().map(|weight| (weight / factor).round() * factor).collect()
+    }
+
+    #[test]
+    fn sums_of_the_largest_bytes_are_exact() {
+        const INPUTS: usize = 1000;
+        for instructions in ReducedInstructions::all(Precision::Int8) {
+            for (input, weight) in [(1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0)] {
+                let weights = vec![weight; INPUTS * 20];
+                let packed = ReducedWeights::with(instructions, Precision::Int8, [&weights, &[0.0; 20]], INPUTS);
+                let mut out = [0.0; 7 * 20];
+                packed.multiply_rows(&vec![input; 7 * INPUTS], &mut out);
+                let expected = input * weight * INPUTS as f32;
+                assert!(
+                    out.iter().all(|found| (found - expected).abs() < 1e-3),
+                    "{instructions:?}: {out:?}"
+                );
+            }
+        }
     }
 
     #[test]

@@ -2,27 +2,24 @@
 // A function's vector instructions reach what is inlined into it, and only that.
 #![allow(clippy::inline_always)]
 
-use std::arch::aarch64::{
-    float32x4_t, int32x4_t, vaddq_f32, vcvtq_f32_s32, vdupq_n_f32, vdupq_n_s32, veorq_s32, vmlsq_s32, vmulq_f32,
-};
+use std::arch::aarch64::{int32x4_t, vdupq_n_s32, veorq_s32};
 use std::arch::asm;
 
-use super::products::products;
+use super::products::{finished, products};
 use super::{ByteRange, Group, LANES, PlaceGroups, ReducedPanel, ReducedProduct, Register};
 use crate::nn::ops::casts::casts;
 use crate::nn::precision::Precision;
 
 /// Registers of a vector of outputs, four in each.
 const QUARTERS: usize = LANES / 4;
-/// Inputs are bytes without a sign, and the instruction takes bytes with one. This turns byte b of a group into b − 128.
+/// XOR with this turns each byte b of a group into the byte with a sign b − 128, which the instruction takes.
 const SIGNS: i32 = i32::from_ne_bytes([0x80; 4]);
+/// By how much these bytes are less.
 const SHIFT: i32 = 128;
 
 casts! {
     group_bits: Register<Group> => [int32x4_t; QUARTERS];
-    whole_bits: Register<i32> => [int32x4_t; QUARTERS];
-    float_bits: Register<f32> => [float32x4_t; QUARTERS];
-    floats: [float32x4_t; QUARTERS] => Register<f32>;
+    whole: [int32x4_t; QUARTERS] => Register<i32>;
 }
 
 /// Computes a product of bytes.
@@ -41,7 +38,7 @@ pub(super) fn multiply(product: ReducedProduct) {
 }
 
 products!(
-    fn multiply_bytes, "neon,dotprod", places { 1: 6, 3; }
+    fn multiply_bytes, "neon,dotprod", places 6 then 3, vectors 1,
     sums [vdupq_n_s32(0); QUARTERS], weights group_bits, group of_all, add add_products, finish finish
 );
 
@@ -49,7 +46,7 @@ products!(
 #[target_feature(enable = "neon,dotprod")]
 #[inline]
 fn of_all(group: Group) -> int32x4_t {
-    veorq_s32(vdupq_n_s32(SIGNS), vdupq_n_s32(i32::from_le_bytes(group)))
+    veorq_s32(vdupq_n_s32(SIGNS), vdupq_n_s32(i32::from_ne_bytes(group)))
 }
 
 /// Adds to each sum four products.
@@ -76,23 +73,9 @@ fn add_products(
     sums
 }
 
-/// What sums of products of shifted bytes stand for, with the bias.
+/// What sums of products of shifted bytes stand for.
 #[target_feature(enable = "neon,dotprod")]
 #[inline]
-fn finish(
-    mut sums: [int32x4_t; QUARTERS],
-    range: Option<ByteRange>,
-    panel: &ReducedPanel,
-    vector: usize,
-) -> Register<f32> {
-    let ByteRange { scale, zero } = range.unwrap_or_default();
-    let zero = vdupq_n_s32(i32::from(zero) - SHIFT);
-    let weight_sums = whole_bits(panel.weight_sums[vector]);
-    let [mut values, bias] = [panel.factors[vector], panel.bias[vector]].map(float_bits);
-    for at in 0..QUARTERS {
-        sums[at] = vmlsq_s32(sums[at], zero, weight_sums[at]);
-        let factor = vmulq_f32(vdupq_n_f32(scale), values[at]);
-        values[at] = vaddq_f32(vmulq_f32(vcvtq_f32_s32(sums[at]), factor), bias[at]);
-    }
-    floats(values)
+fn finish(sums: [int32x4_t; QUARTERS], range: Option<ByteRange>, panel: &ReducedPanel, vector: usize) -> Register<f32> {
+    finished(whole(sums), SHIFT, range, panel, vector)
 }

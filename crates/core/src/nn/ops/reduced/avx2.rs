@@ -1,15 +1,14 @@
-//! The products of bytes on x86-64 processors without AVX-512. Two products are added up in 16 bits before they become a sum of 32:
-//! so weights have 7 bits, whose sums of two always fit.
+//! The products of bytes on x86-64 processors with AVX2 and without AVX-512 VNNI. AVX2 adds up two products in 16 bits before it widens
+//! them to 32. So weights are at most ±63: two products always fit.
 // A function's vector instructions reach what is inlined into it, and only that.
 #![allow(clippy::inline_always)]
 
 use std::arch::x86_64::{
-    __m256, __m256i, _mm256_add_epi32, _mm256_add_ps, _mm256_cvtepi32_ps, _mm256_madd_epi16, _mm256_maddubs_epi16,
-    _mm256_mul_ps, _mm256_mullo_epi32, _mm256_set1_epi16, _mm256_set1_epi32, _mm256_set1_ps, _mm256_setzero_si256,
-    _mm256_sub_epi32,
+    __m256i, _mm256_add_epi32, _mm256_madd_epi16, _mm256_maddubs_epi16, _mm256_set1_epi16, _mm256_set1_epi32,
+    _mm256_setzero_si256,
 };
 
-use super::products::products;
+use super::products::{finished, products};
 use super::{ByteRange, Group, PlaceGroups, ReducedPanel, ReducedProduct, Register};
 use crate::nn::ops::casts::casts;
 use crate::nn::precision::Precision;
@@ -19,9 +18,7 @@ pub(super) const MOST_OF_WEIGHT: f32 = 63.0;
 
 casts! {
     group_bits: Register<Group> => [__m256i; 2];
-    whole_bits: Register<i32> => [__m256i; 2];
-    float_bits: Register<f32> => [__m256; 2];
-    floats: [__m256; 2] => Register<f32>;
+    whole: [__m256i; 2] => Register<i32>;
 }
 
 /// Computes a product of bytes.
@@ -40,7 +37,7 @@ pub(super) fn multiply(product: ReducedProduct) {
 }
 
 products!(
-    fn multiply_bytes, "avx2", places { 1: 4, 2; }
+    fn multiply_bytes, "avx2", places 4 then 2, vectors 1,
     sums [_mm256_setzero_si256(); 2], weights group_bits, group of_all, add add_products, finish finish
 );
 
@@ -63,18 +60,9 @@ fn add_products(mut sums: [__m256i; 2], group: __m256i, weights: [__m256i; 2]) -
     sums
 }
 
-/// What sums of products of bytes stand for, with the bias.
+/// What sums of products of bytes stand for.
 #[target_feature(enable = "avx2")]
 #[inline]
 fn finish(sums: [__m256i; 2], range: Option<ByteRange>, panel: &ReducedPanel, vector: usize) -> Register<f32> {
-    let ByteRange { scale, zero } = range.unwrap_or_default();
-    let weight_sums = whole_bits(panel.weight_sums[vector]);
-    let [mut values, bias] = [panel.factors[vector], panel.bias[vector]].map(float_bits);
-    for half in 0..2 {
-        let of_zeros = _mm256_mullo_epi32(_mm256_set1_epi32(zero.into()), weight_sums[half]);
-        let factor = _mm256_mul_ps(_mm256_set1_ps(scale), values[half]);
-        let sum = _mm256_cvtepi32_ps(_mm256_sub_epi32(sums[half], of_zeros));
-        values[half] = _mm256_add_ps(_mm256_mul_ps(sum, factor), bias[half]);
-    }
-    floats(values)
+    finished(whole(sums), 0, range, panel, vector)
 }

@@ -3,24 +3,14 @@
 #![allow(clippy::inline_always)]
 
 use std::arch::x86_64::{
-    __m512, __m512bh, __m512i, _mm512_add_ps, _mm512_cvtepi32_ps, _mm512_dpbf16_ps, _mm512_dpbusd_epi32, _mm512_max_ps,
-    _mm512_min_ps, _mm512_mul_ps, _mm512_mullo_epi32, _mm512_reduce_max_ps, _mm512_reduce_min_ps, _mm512_set1_epi32,
-    _mm512_set1_ps, _mm512_setzero_ps, _mm512_setzero_si512, _mm512_sub_epi32,
+    __m512, __m512bh, __m512i, _mm512_add_ps, _mm512_dpbf16_ps, _mm512_dpbusd_epi32, _mm512_max_ps, _mm512_min_ps,
+    _mm512_reduce_max_ps, _mm512_reduce_min_ps, _mm512_set1_epi32, _mm512_setzero_ps, _mm512_setzero_si512,
 };
 
-use super::products::products;
+use super::products::{finished, products};
 use super::{ByteRange, Group, LANES, PlaceGroups, ReducedPanel, ReducedProduct, Register};
 use crate::nn::ops::casts::casts;
 use crate::nn::precision::{Precision, multiplies_four_bytes};
-
-/// Whether this processor has the instructions.
-pub(super) fn multiplies(precision: Precision) -> bool {
-    match precision {
-        Precision::F32 => false,
-        Precision::Bf16 => precision.is_supported(),
-        Precision::Int8 => multiplies_four_bytes(),
-    }
-}
 
 /// Computes a product with the instructions of its precision.
 #[expect(
@@ -30,13 +20,13 @@ pub(super) fn multiplies(precision: Precision) -> bool {
 pub(super) fn multiply(product: ReducedProduct) {
     let precision = product.weights.precision;
     assert!(
-        multiplies(precision),
+        precision.is_supported() && (precision == Precision::Bf16 || multiplies_four_bytes()),
         "weights in {precision} on this processor are a bug"
     );
     match precision {
-        // SAFETY: `multiplies` found the features of this function.
+        // SAFETY: `multiplies_four_bytes` found the features of this function.
         Precision::Int8 => unsafe { multiply_bytes(product) },
-        // SAFETY: the same.
+        // SAFETY: `is_supported` found them.
         Precision::Bf16 => unsafe { multiply_halves(product) },
         Precision::F32 => unreachable!("reduced weights in single precision are a bug"),
     }
@@ -48,8 +38,8 @@ pub(super) fn multiply(product: ReducedProduct) {
     reason = "only the processor can tell whether it has the instructions, and it is asked first"
 )]
 pub(super) fn extremes(values: &[f32]) -> (f32, f32) {
-    assert!(multiplies(Precision::Int8), "bytes on this processor are a bug");
-    // SAFETY: `multiplies` found the features of this function.
+    assert!(multiplies_four_bytes(), "bytes on this processor are a bug");
+    // SAFETY: `multiplies_four_bytes` found the features of this function.
     unsafe { extremes_of_vectors(values) }
 }
 
@@ -84,23 +74,20 @@ fn extremes_of_vectors(values: &[f32]) -> (f32, f32) {
     (_mm512_reduce_min_ps(least), _mm512_reduce_max_ps(most))
 }
 
-/// Most vectors of outputs whose sums are kept in registers together.
-pub(super) const MOST_VECTORS: usize = 3;
-
 casts! {
     group_bits: Register<Group> => __m512i;
-    whole_bits: Register<i32> => __m512i;
+    whole: __m512i => Register<i32>;
     float_bits: Register<f32> => __m512;
     halves: __m512i => __m512bh;
     floats: __m512 => Register<f32>;
 }
 
 products!(
-    fn multiply_halves, "avx512f,avx512bf16", places { 1: 8, 4; 2: 8, 4; 3: 8, 4; }
+    fn multiply_halves, "avx512f,avx512bf16", places 8 then 4, vectors 1 2 3,
     sums _mm512_setzero_ps(), weights group_bits, group of_all, add add_halves, finish finish_halves
 );
 products!(
-    fn multiply_bytes, "avx512f,avx512vnni", places { 1: 8, 4; 2: 8, 4; 3: 8, 4; }
+    fn multiply_bytes, "avx512f,avx512vnni", places 8 then 4, vectors 1 2 3,
     sums _mm512_setzero_si512(), weights group_bits, group of_all, add _mm512_dpbusd_epi32, finish finish_bytes
 );
 
@@ -124,13 +111,9 @@ fn finish_halves(sum: __m512, _: Option<ByteRange>, panel: &ReducedPanel, vector
     floats(_mm512_add_ps(sum, float_bits(panel.bias[vector])))
 }
 
-/// What sums of products of bytes stand for, with the bias.
+/// What sums of products of bytes stand for.
 #[target_feature(enable = "avx512f")]
 #[inline]
 fn finish_bytes(sum: __m512i, range: Option<ByteRange>, panel: &ReducedPanel, vector: usize) -> Register<f32> {
-    let ByteRange { scale, zero } = range.unwrap_or_default();
-    let of_zeros = _mm512_mullo_epi32(_mm512_set1_epi32(zero.into()), whole_bits(panel.weight_sums[vector]));
-    let factor = _mm512_mul_ps(_mm512_set1_ps(scale), float_bits(panel.factors[vector]));
-    let value = _mm512_mul_ps(_mm512_cvtepi32_ps(_mm512_sub_epi32(sum, of_zeros)), factor);
-    floats(_mm512_add_ps(value, float_bits(panel.bias[vector])))
+    finished(whole(sum), 0, range, panel, vector)
 }

@@ -5,28 +5,28 @@
 use super::{ByteRange, LANES, PlaceGroups, ReducedPanel, ReducedProduct, Register};
 use crate::nn::ops::packed::StartSums;
 
-/// A function that computes a product with instructions of its own. The sums of some vectors of outputs at some places stay in registers
-/// while the inputs and weights pass by: for each number of vectors, at so many places, then at fewer, then at one after the other.
+/// A function that computes a product with instructions of its own. The sums of one of these numbers of vectors of outputs stay in registers
+/// while the inputs and weights pass by: at so many places, of the rest at fewer, and of the last ones at each alone.
 macro_rules! products {
     (
-        fn $name:ident, $features:literal, places { $($vectors:literal: $places:literal, $fewer:literal;)* }
+        fn $name:ident, $features:literal, places $places:literal then $fewer:literal, vectors $($vectors:literal)*,
         sums $no_sum:expr, weights $weights:path, group $group:path, add $add:path, finish $finish:path
     ) => {
         #[target_feature(enable = $features)]
         fn $name(mut product: ReducedProduct) {
             #[target_feature(enable = $features)]
-            fn panel<const PLACES: usize, const FEWER: usize, const VECTORS: usize>(
+            fn panel<const VECTORS: usize>(
                 product: &mut ReducedProduct,
                 panel: &ReducedPanel,
             ) {
                 let (mut place, places) = (0, product.out.len() / product.weights.outputs);
-                while place + PLACES <= places {
-                    block::<PLACES, VECTORS>(product, panel, place);
-                    place += PLACES;
+                while place + $places <= places {
+                    block::<$places, VECTORS>(product, panel, place);
+                    place += $places;
                 }
-                while place + FEWER <= places {
-                    block::<FEWER, VECTORS>(product, panel, place);
-                    place += FEWER;
+                while place + $fewer <= places {
+                    block::<$fewer, VECTORS>(product, panel, place);
+                    place += $fewer;
                 }
                 while place < places {
                     block::<1, VECTORS>(product, panel, place);
@@ -72,7 +72,7 @@ macro_rules! products {
 
             for outputs in &product.weights.panels {
                 match outputs.vectors {
-                    $($vectors => panel::<$places, $fewer, $vectors>(&mut product, outputs),)*
+                    $($vectors => panel::<$vectors>(&mut product, outputs),)*
                     others => unreachable!("{others} vectors of outputs are a bug"),
                 }
             }
@@ -114,4 +114,24 @@ impl ReducedProduct<'_> {
             }
         }
     }
+}
+
+/// What sums of products of bytes stand for, with the bias. The bytes of inputs are less by `shift`.
+#[inline(always)]
+pub(super) fn finished(
+    Register(sums): Register<i32>,
+    shift: i32,
+    range: Option<ByteRange>,
+    panel: &ReducedPanel,
+    vector: usize,
+) -> Register<f32> {
+    let ByteRange { scale, zero } = range.expect("bytes without a range are a bug");
+    let zero = i32::from(zero) - shift;
+    let Register(mut values) = panel.bias[vector];
+    for lane in 0..LANES {
+        let of_zeros = zero.wrapping_mul(panel.weight_sums[vector].0[lane]);
+        let factor = scale * panel.factors[vector].0[lane];
+        values[lane] += sums[lane].wrapping_sub(of_zeros) as f32 * factor;
+    }
+    Register(values)
 }
