@@ -87,7 +87,7 @@ pub(super) struct CollectArgs {
     /// How many trials to simulate
     #[arg(long, default_value_t = 1000, value_parser = value_parser!(u64).range(1..=MAX_TRIALS))]
     trials: u64,
-    /// The seed of all random numbers: the same seed gives the same bytes
+    /// The seed of all random numbers: on processors of one kind, the same seed gives the same bytes
     #[arg(long, default_value_t = 1)]
     seed: u64,
     /// The data set's name [default: SCENARIO, with `--rooms` SCENARIO-SET]

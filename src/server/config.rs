@@ -79,7 +79,7 @@ settings! {
     #[schema(value_type = String)]
     device: DeviceName = DeviceName::Cpu;
     /// In which numbers the processor predicts: `f32`, or for faster and slightly less exact predictions `bf16` (needs a processor
-    /// with AVX-512 BF16) or `int8` (AVX-512 VNNI; AVX2, for dense networks only; or 64-bit ARM with dot products).
+    /// with AVX-512 BF16) or `int8` (AVX-512 VNNI, or 64-bit ARM with dot products; AVX2 for dense networks only).
     #[schema(value_type = String)]
     precision: Precision = Precision::F32;
     /// `sqlite:FILE` or `postgres://…`. Default: a file in the data directory.
