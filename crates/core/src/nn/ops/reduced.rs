@@ -85,9 +85,7 @@ impl ReducedWeights {
     /// processor without instructions for the precision is a bug.
     pub(super) fn new(weights: &[f32], bias: &[f32], run: usize, precision: Precision) -> Self {
         let instructions = ReducedInstructions::all(precision);
-        let fastest = instructions
-            .first()
-            .expect("weights of an unsupported precision are a bug");
+        let fastest = instructions.first().expect("an unsupported precision is a bug");
         Self::with(*fastest, precision, [weights, bias], run)
     }
 

@@ -3,12 +3,12 @@
 #![allow(clippy::inline_always)]
 
 use std::arch::x86_64::{
-    __m512, __m512bh, __m512i, _mm512_add_ps, _mm512_dpbf16_ps, _mm512_dpbusd_epi32, _mm512_max_ps, _mm512_min_ps,
-    _mm512_reduce_max_ps, _mm512_reduce_min_ps, _mm512_set1_epi32, _mm512_setzero_ps, _mm512_setzero_si512,
+    __m512, __m512bh, __m512i, _mm512_add_ps, _mm512_dpbf16_ps, _mm512_dpbusd_epi32, _mm512_set1_epi32,
+    _mm512_setzero_ps, _mm512_setzero_si512,
 };
 
 use super::products::{finished, products};
-use super::{ByteRange, Group, LANES, PlaceGroups, ReducedPanel, ReducedProduct, Register};
+use super::{ByteRange, Group, PlaceGroups, ReducedPanel, ReducedProduct, Register};
 use crate::nn::ops::casts::casts;
 use crate::nn::precision::{Precision, multiplies_four_bytes};
 
@@ -30,48 +30,6 @@ pub(super) fn multiply(product: ReducedProduct) {
         Precision::Bf16 => unsafe { multiply_halves(product) },
         Precision::F32 => unreachable!("reduced weights in single precision are a bug"),
     }
-}
-
-/// The least and the largest of the values and of 0.
-#[expect(
-    unsafe_code,
-    reason = "only the processor can tell whether it has the instructions, and it is asked first"
-)]
-pub(super) fn extremes(values: &[f32]) -> (f32, f32) {
-    assert!(multiplies_four_bytes(), "bytes on this processor are a bug");
-    // SAFETY: `multiplies_four_bytes` found the features of this function.
-    unsafe { extremes_of_vectors(values) }
-}
-
-#[target_feature(enable = "avx512f")]
-fn extremes_of_vectors(values: &[f32]) -> (f32, f32) {
-    /// Vectors, so that none waits for the one before.
-    const TOGETHER: usize = 4;
-    let (vectors, rest) = values.as_chunks::<LANES>();
-    let (together, others) = vectors.as_chunks::<TOGETHER>();
-    let mut least = [_mm512_setzero_ps(); TOGETHER];
-    let mut most = least;
-    for vectors in together {
-        for at in 0..TOGETHER {
-            let values = float_bits(Register(vectors[at]));
-            least[at] = _mm512_min_ps(values, least[at]);
-            most[at] = _mm512_max_ps(values, most[at]);
-        }
-    }
-    let mut last = Register([0.0; LANES]);
-    last.0[..rest.len()].copy_from_slice(rest);
-    for vector in others.iter().chain([&last.0]) {
-        let values = float_bits(Register(*vector));
-        least[0] = _mm512_min_ps(values, least[0]);
-        most[0] = _mm512_max_ps(values, most[0]);
-    }
-    let least = least
-        .into_iter()
-        .fold(_mm512_setzero_ps(), |least, vector| _mm512_min_ps(vector, least));
-    let most = most
-        .into_iter()
-        .fold(_mm512_setzero_ps(), |most, vector| _mm512_max_ps(vector, most));
-    (_mm512_reduce_min_ps(least), _mm512_reduce_max_ps(most))
 }
 
 casts! {

@@ -2,12 +2,8 @@
 // A closure's vector instructions reach what is inlined into it, and only that.
 #![allow(clippy::inline_always)]
 
-#[cfg(target_arch = "x86_64")]
-use super::avx512;
 use super::{Group, LANES, inputs_of_group};
 use crate::nn::precision::Precision;
-#[cfg(target_arch = "x86_64")]
-use crate::nn::precision::multiplies_four_bytes;
 use crate::vectorized::vectorized;
 
 /// The largest byte of an input.
@@ -68,10 +64,6 @@ impl ByteRange {
 fn extremes(values: &[f32]) -> (f32, f32) {
     /// Values that are compared at once: some vectors, so that none waits for the one before.
     const TOGETHER: usize = 2 * LANES;
-    #[cfg(target_arch = "x86_64")]
-    if multiplies_four_bytes() {
-        return avx512::extremes(values);
-    }
     vectorized(
         #[inline(always)]
         || {

@@ -125,7 +125,7 @@ pub(super) fn finished(
     panel: &ReducedPanel,
     vector: usize,
 ) -> Register<f32> {
-    let ByteRange { scale, zero } = range.expect("bytes without a range are a bug");
+    let ByteRange { scale, zero } = range.expect("a place without a range is a bug");
     let zero = i32::from(zero) - shift;
     let Register(mut values) = panel.bias[vector];
     for lane in 0..LANES {
