@@ -73,9 +73,14 @@ impl Precision {
         if self.is_supported() {
             return Ok(());
         }
-        let instructions = self.instructions();
+        let supported: Vec<String> = Self::ALL
+            .into_iter()
+            .filter(|precision| precision.is_supported())
+            .map(|precision| format!("\"{precision}\""))
+            .collect();
+        let (instructions, supported) = (self.instructions(), supported.join(" or "));
         Err(self.refused(format!(
-            "this processor has no {instructions}; use \"f32\", which every processor has"
+            "this processor has no {instructions}; it predicts in {supported}"
         )))
     }
 
@@ -90,7 +95,7 @@ impl Precision {
     fn instructions(self) -> &'static str {
         match self {
             Self::F32 => "",
-            Self::Bf16 => "AVX-512 BF16",
+            Self::Bf16 => "AVX-512 BF16 (of x86-64)",
             Self::Int8 if cfg!(target_arch = "aarch64") => "dot products of bytes (ARM's \"asimddp\")",
             Self::Int8 => "AVX2",
         }

@@ -14,6 +14,7 @@ use super::EvaluationError;
 use super::config::EvaluateConfig;
 use super::inference::Inference;
 use foreframe_core::files::{sha256_hex, write_atomically};
+use foreframe_core::nn::precision;
 use foreframe_core::registry::{Model, ProgramStamp};
 use foreframe_core::types::Seed;
 
@@ -129,6 +130,7 @@ pub(super) fn inputs(inference: Inference, config: &EvaluateConfig, split_seed: 
         "nearest_windows": config.nearest_windows,
         "seed": config.seed,
         "batch": config.batch,
+        "precision": precision::current(),
     });
     sha256_hex(inputs.to_string().as_bytes())
 }

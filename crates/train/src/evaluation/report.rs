@@ -17,6 +17,7 @@ use super::ranking::PlanRanking;
 use super::skill::{Skill, skill};
 use super::surroundings::SurroundingsScores;
 use super::uncertainty::{NoveltyScores, UncertaintyScores};
+use foreframe_core::nn::precision::{self, Precision};
 use foreframe_core::registry::{DatasetStamp, Model, ProgramStamp};
 use foreframe_core::types::{ModelName, Seed};
 use foreframe_data::dataset::Window;
@@ -118,6 +119,10 @@ pub struct ReportStamp {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[doc(hidden)]
     pub brightness: Option<f64>,
+    /// The numbers of 16 or 8 bits that the network's products were computed in; absent in single precision.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[doc(hidden)]
+    pub precision: Option<Precision>,
     /// The program's version and the commit it was built from.
     pub program: ProgramStamp,
     /// The command line.
@@ -151,6 +156,7 @@ impl ReportStamp {
             twins: config.twins.iter().map(|twin| named(twin)).collect(),
             split: config.split,
             brightness: (brightness != 1.0).then_some(brightness),
+            precision: Some(precision::current()).filter(|precision| *precision != Precision::F32),
             program: ProgramStamp::current(),
             command: config.command.clone(),
             stride: config.stride,
