@@ -85,6 +85,7 @@ mod own_data;
 mod packed_prediction;
 mod path_traversal;
 mod plans;
+mod precision;
 mod process;
 mod program;
 mod readme;

@@ -28,6 +28,7 @@ use crate::vectorized::vectorized;
 
 /// Outputs whose sums are computed together.
 const LANES: usize = 16;
+
 /// Neighbouring inputs of a place.
 pub(super) type Group = [u8; 4];
 
@@ -155,9 +156,7 @@ impl ReducedWeights {
             self.multiply(inputs, out, StartSums::Bias);
         });
     }
-}
 
-impl ReducedWeights {
     /// The weights and the bias of the vectors `from..to` of outputs.
     fn panel(&self, [weights, bias]: [&[f32]; 2], [from, to]: [usize; 2], run: usize) -> ReducedPanel {
         let (outputs, precision) = (self.outputs, self.precision);
@@ -290,39 +289,37 @@ mod tests {
     }
 
     fn check_products(precision: Precision, instructions: ReducedInstructions) {
-        {
-            for (rows, inputs, outputs) in [
-                (1, 3, 1),
-                (13, 20, 12),
-                (8, 7, 16),
-                (30, 33, 48),
-                (5, 9, 50),
-                (3, 4, 129),
-            ] {
-                let (x, weights, bias) = (
-                    values(rows * inputs, 1),
-                    values(inputs * outputs, 2),
-                    values(outputs, 3),
+        for (rows, inputs, outputs) in [
+            (1, 3, 1),
+            (13, 20, 12),
+            (8, 7, 16),
+            (30, 33, 48),
+            (5, 9, 50),
+            (3, 4, 129),
+        ] {
+            let (x, weights, bias) = (
+                values(rows * inputs, 1),
+                values(inputs * outputs, 2),
+                values(outputs, 3),
+            );
+            let mut out = vec![7.0; rows * outputs];
+            let packed = ReducedWeights::with(instructions, precision, [&weights, &bias], inputs);
+            packed.multiply_rows(&x, &mut out);
+            for (index, found) in out.iter().enumerate() {
+                let (row, output) = (index / outputs, index % outputs);
+                let row = &x[row * inputs..(row + 1) * inputs];
+                let column: Vec<f32> = (0..inputs).map(|input| weights[input * outputs + output]).collect();
+                let (row, column) = match precision {
+                    Precision::Int8 => (of_bytes(row), of_weight_bytes(&column, instructions.most_of_weight())),
+                    _ => [row, &column]
+                        .map(|values| values.iter().map(|value| half(*value)).collect())
+                        .into(),
+                };
+                let expected = bias[output] + row.iter().zip(&column).map(|(x, w)| x * w).sum::<f32>();
+                assert!(
+                    (found - expected).abs() < 2e-5,
+                    "{instructions:?}, {precision}: {found} {expected}"
                 );
-                let mut out = vec![7.0; rows * outputs];
-                let packed = ReducedWeights::with(instructions, precision, [&weights, &bias], inputs);
-                packed.multiply_rows(&x, &mut out);
-                for (index, found) in out.iter().enumerate() {
-                    let (row, output) = (index / outputs, index % outputs);
-                    let row = &x[row * inputs..(row + 1) * inputs];
-                    let column: Vec<f32> = (0..inputs).map(|input| weights[input * outputs + output]).collect();
-                    let (row, column) = match precision {
-                        Precision::Int8 => (of_bytes(row), of_weight_bytes(&column, instructions.most_of_weight())),
-                        _ => [row, &column]
-                            .map(|values| values.iter().map(|value| half(*value)).collect())
-                            .into(),
-                    };
-                    let expected = bias[output] + row.iter().zip(&column).map(|(x, w)| x * w).sum::<f32>();
-                    assert!(
-                        (found - expected).abs() < 2e-5,
-                        "{instructions:?}, {precision}: {found} {expected}"
-                    );
-                }
             }
         }
     }

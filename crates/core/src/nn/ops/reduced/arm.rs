@@ -5,10 +5,9 @@
 use std::arch::aarch64::{int32x4_t, vdupq_n_s32, veorq_s32};
 use std::arch::asm;
 
-use super::products::{finished, products};
+use super::products::{dequantized, products};
 use super::{ByteRange, Group, LANES, PlaceGroups, ReducedPanel, ReducedProduct, Register};
 use crate::nn::ops::casts::casts;
-use crate::nn::precision::Precision;
 
 /// Registers of a vector of outputs, four in each.
 const QUARTERS: usize = LANES / 4;
@@ -20,21 +19,6 @@ const SHIFT: i32 = 128;
 casts! {
     group_bits: Register<Group> => [int32x4_t; QUARTERS];
     whole: [int32x4_t; QUARTERS] => Register<i32>;
-}
-
-/// Computes a product of bytes.
-#[expect(
-    unsafe_code,
-    reason = "only the processor can tell whether it has the instructions, and it is asked first"
-)]
-pub(super) fn multiply(product: ReducedProduct) {
-    let precision = product.weights.precision;
-    assert!(
-        precision == Precision::Int8 && precision.is_supported(),
-        "weights in {precision} on this processor are a bug"
-    );
-    // SAFETY: `is_supported` found the features of this function.
-    unsafe { multiply_bytes(product) }
 }
 
 products!(
@@ -77,5 +61,5 @@ fn add_products(
 #[target_feature(enable = "neon,dotprod")]
 #[inline]
 fn finish(sums: [int32x4_t; QUARTERS], range: Option<ByteRange>, panel: &ReducedPanel, vector: usize) -> Register<f32> {
-    finished(whole(sums), SHIFT, range, panel, vector)
+    dequantized(whole(sums), SHIFT, range, panel, vector)
 }

@@ -8,10 +8,9 @@ use std::arch::x86_64::{
     _mm256_setzero_si256,
 };
 
-use super::products::{finished, products};
+use super::products::{dequantized, products};
 use super::{ByteRange, Group, PlaceGroups, ReducedPanel, ReducedProduct, Register};
 use crate::nn::ops::casts::casts;
-use crate::nn::precision::Precision;
 
 /// The largest byte of a weight: 2 · 255 · 63 fits 16 bits.
 pub(super) const MOST_OF_WEIGHT: f32 = 63.0;
@@ -19,21 +18,6 @@ pub(super) const MOST_OF_WEIGHT: f32 = 63.0;
 casts! {
     group_bits: Register<Group> => [__m256i; 2];
     whole: [__m256i; 2] => Register<i32>;
-}
-
-/// Computes a product of bytes.
-#[expect(
-    unsafe_code,
-    reason = "only the processor can tell whether it has the instructions, and it is asked first"
-)]
-pub(super) fn multiply(product: ReducedProduct) {
-    let precision = product.weights.precision;
-    assert!(
-        precision == Precision::Int8 && precision.is_supported(),
-        "weights in {precision} on this processor are a bug"
-    );
-    // SAFETY: `is_supported` found AVX2.
-    unsafe { multiply_bytes(product) }
 }
 
 products!(
@@ -64,5 +48,5 @@ fn add_products(mut sums: [__m256i; 2], group: __m256i, weights: [__m256i; 2]) -
 #[target_feature(enable = "avx2")]
 #[inline]
 fn finish(sums: [__m256i; 2], range: Option<ByteRange>, panel: &ReducedPanel, vector: usize) -> Register<f32> {
-    finished(whole(sums), 0, range, panel, vector)
+    dequantized(whole(sums), 0, range, panel, vector)
 }

@@ -7,30 +7,9 @@ use std::arch::x86_64::{
     _mm512_setzero_ps, _mm512_setzero_si512,
 };
 
-use super::products::{finished, products};
+use super::products::{dequantized, products};
 use super::{ByteRange, Group, PlaceGroups, ReducedPanel, ReducedProduct, Register};
 use crate::nn::ops::casts::casts;
-use crate::nn::precision::{Precision, multiplies_four_bytes};
-
-/// Computes a product with the instructions of its precision.
-#[expect(
-    unsafe_code,
-    reason = "only the processor can tell whether it has the instructions, and it is asked first"
-)]
-pub(super) fn multiply(product: ReducedProduct) {
-    let precision = product.weights.precision;
-    assert!(
-        precision.is_supported() && (precision == Precision::Bf16 || multiplies_four_bytes()),
-        "weights in {precision} on this processor are a bug"
-    );
-    match precision {
-        // SAFETY: `multiplies_four_bytes` found the features of this function.
-        Precision::Int8 => unsafe { multiply_bytes(product) },
-        // SAFETY: `is_supported` found them.
-        Precision::Bf16 => unsafe { multiply_halves(product) },
-        Precision::F32 => unreachable!("reduced weights in single precision are a bug"),
-    }
-}
 
 casts! {
     group_bits: Register<Group> => __m512i;
@@ -73,5 +52,5 @@ fn finish_halves(sum: __m512, _: Option<ByteRange>, panel: &ReducedPanel, vector
 #[target_feature(enable = "avx512f")]
 #[inline]
 fn finish_bytes(sum: __m512i, range: Option<ByteRange>, panel: &ReducedPanel, vector: usize) -> Register<f32> {
-    finished(whole(sum), 0, range, panel, vector)
+    dequantized(whole(sum), 0, range, panel, vector)
 }

@@ -11,34 +11,50 @@ use crate::nn::precision::{Precision, multiplies_four_bytes};
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum ReducedInstructions {
     #[cfg(target_arch = "x86_64")]
-    Avx512,
+    Avx512Halves,
     #[cfg(target_arch = "x86_64")]
-    Avx2,
+    Avx512Bytes,
+    #[cfg(target_arch = "x86_64")]
+    Avx2Bytes,
     #[cfg(target_arch = "aarch64")]
-    Arm,
+    ArmBytes,
 }
 
 impl ReducedInstructions {
     /// Those of this processor for a precision, the fastest first.
     pub(super) fn all(precision: Precision) -> Vec<Self> {
-        let is_for_bytes = precision == Precision::Int8;
-        let each = [
+        let each: &[(Self, Precision)] = &[
             #[cfg(target_arch = "x86_64")]
-            (Self::Avx512, precision == Precision::Bf16 || multiplies_four_bytes()),
+            (Self::Avx512Halves, Precision::Bf16),
             #[cfg(target_arch = "x86_64")]
-            (Self::Avx2, is_for_bytes),
+            (Self::Avx512Bytes, Precision::Int8),
+            #[cfg(target_arch = "x86_64")]
+            (Self::Avx2Bytes, Precision::Int8),
             #[cfg(target_arch = "aarch64")]
-            (Self::Arm, is_for_bytes && multiplies_four_bytes()),
+            (Self::ArmBytes, Precision::Int8),
         ];
-        let supported = each.into_iter().filter(|(_, has)| precision.is_supported() && *has);
-        supported.map(|(instructions, _)| instructions).collect()
+        let suitable = each
+            .iter()
+            .filter(|(instructions, of)| *of == precision && instructions.are_supported());
+        suitable.map(|(instructions, _)| *instructions).collect()
+    }
+
+    fn are_supported(self) -> bool {
+        match self {
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx512Halves => Precision::Bf16.is_supported(),
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx2Bytes => Precision::Int8.is_supported(),
+            // Those of four bytes at once.
+            _ => multiplies_four_bytes(),
+        }
     }
 
     /// Most vectors of outputs whose sums are kept in registers together.
     pub(super) fn most_vectors(self) -> usize {
         match self {
             #[cfg(target_arch = "x86_64")]
-            Self::Avx512 => 3,
+            Self::Avx512Halves | Self::Avx512Bytes => 3,
             _ => 1,
         }
     }
@@ -47,19 +63,30 @@ impl ReducedInstructions {
     pub(super) fn most_of_weight(self) -> f32 {
         match self {
             #[cfg(target_arch = "x86_64")]
-            Self::Avx2 => avx2::MOST_OF_WEIGHT,
+            Self::Avx2Bytes => avx2::MOST_OF_WEIGHT,
             _ => 127.0,
         }
     }
 
+    /// Computes a product. A processor without the instructions is a bug.
+    #[expect(
+        unsafe_code,
+        reason = "only the processor can tell whether it has the instructions, and it is asked first"
+    )]
     pub(super) fn multiply(self, product: ReducedProduct) {
-        match self {
-            #[cfg(target_arch = "x86_64")]
-            Self::Avx512 => avx512::multiply(product),
-            #[cfg(target_arch = "x86_64")]
-            Self::Avx2 => avx2::multiply(product),
-            #[cfg(target_arch = "aarch64")]
-            Self::Arm => arm::multiply(product),
+        assert!(self.are_supported(), "{self:?} on this processor is a bug");
+        // SAFETY: this processor has the instructions.
+        unsafe {
+            match self {
+                #[cfg(target_arch = "x86_64")]
+                Self::Avx512Halves => avx512::multiply_halves(product),
+                #[cfg(target_arch = "x86_64")]
+                Self::Avx512Bytes => avx512::multiply_bytes(product),
+                #[cfg(target_arch = "x86_64")]
+                Self::Avx2Bytes => avx2::multiply_bytes(product),
+                #[cfg(target_arch = "aarch64")]
+                Self::ArmBytes => arm::multiply_bytes(product),
+            }
         }
     }
 }

@@ -5,20 +5,18 @@
 use super::{ByteRange, LANES, PlaceGroups, ReducedPanel, ReducedProduct, Register};
 use crate::nn::ops::packed::StartSums;
 
-/// A function that computes a product with instructions of its own. The sums of one of these numbers of vectors of outputs stay in registers
-/// while the inputs and weights pass by: at so many places, of the rest at fewer, and of the last ones at each alone.
+/// A function that computes a product with instructions of its own. `places 8 then 4, vectors 1 2 3`: the sums of 8 places stay in
+/// registers while the inputs and weights pass by, for as many vectors of outputs as a panel has, which is 1, 2 or 3; what is left is
+/// computed for 4 places at once, then for each alone.
 macro_rules! products {
     (
         fn $name:ident, $features:literal, places $places:literal then $fewer:literal, vectors $($vectors:literal)*,
         sums $no_sum:expr, weights $weights:path, group $group:path, add $add:path, finish $finish:path
     ) => {
         #[target_feature(enable = $features)]
-        fn $name(mut product: ReducedProduct) {
+        pub(super) fn $name(mut product: ReducedProduct) {
             #[target_feature(enable = $features)]
-            fn panel<const VECTORS: usize>(
-                product: &mut ReducedProduct,
-                panel: &ReducedPanel,
-            ) {
+            fn panel<const VECTORS: usize>(product: &mut ReducedProduct, panel: &ReducedPanel) {
                 let (mut place, places) = (0, product.out.len() / product.weights.outputs);
                 while place + $places <= places {
                     block::<$places, VECTORS>(product, panel, place);
@@ -116,9 +114,9 @@ impl ReducedProduct<'_> {
     }
 }
 
-/// What sums of products of bytes stand for, with the bias. The bytes of inputs are less by `shift`.
+/// What sums of products of bytes stand for, with the bias. `shift` was taken from each byte of an input before.
 #[inline(always)]
-pub(super) fn finished(
+pub(super) fn dequantized(
     Register(sums): Register<i32>,
     shift: i32,
     range: Option<ByteRange>,
