@@ -20,7 +20,7 @@ ROOT = Path(__file__).resolve().parent.parent
 SNAPSHOT = ROOT / ".ci" / "public-api.txt"
 CRATES = ["core", "sim", "data", "train"]
 # The most names without features, and with all.
-MOST_BARE, MOST_ALL = 60, 154
+MOST_BARE, MOST_ALL = 60, 155
 FORBIDDEN = "candle"
 
 

@@ -42,9 +42,8 @@ fn specs() -> [(&'static str, ModelSpec); 2] {
         channel("linear", "m/s"),
         channel("angular", "rad/s"),
     ];
-    let layers = match TrainConfig::preset("moving-flow").unwrap().model.architecture {
-        ArchitectureConfig::Flow(layers) => layers,
-        ArchitectureConfig::Dense(_) => unreachable!("moving-flow has the flow network"),
+    let ArchitectureConfig::Flow(layers) = TrainConfig::preset("moving-flow").unwrap().model.architecture else {
+        unreachable!("moving-flow has the flow network");
     };
     let flow = ModelSpec {
         architecture: Architecture::Flow(FlowSpec {

@@ -3,7 +3,7 @@
 
 Usage: predict.py --model models/moving --frames examples/frames --actions examples/frames/actions.json --at 4 --out predicted
 
-Needs numpy and pillow. docs/dense-network.md and docs/flow-network.md specify what is computed here. With --server URL, a
+Needs numpy and pillow. docs/dense-network.md, docs/flow-network.md and docs/sprite-network.md specify what is computed here. With --server URL, a
 server is asked too, and each of its pixels must agree within one gray level.
 """
 
@@ -561,6 +561,142 @@ class DepthNetwork(FlowNetwork):
         return self.drawn(z, last, beside, np.zeros(self.shape), room, turned, remembered)
 
 
+# The sprite network.
+
+
+class SpriteNetwork:
+    """Two pictures, cut out of the context, that move as wholes over black."""
+
+    WINDOW, REACH, LEAST_ENERGY, CHANGE_COST, MOST_CHANGE, SPEED_FRAMES = (12, 16), 4, 1.0, 0.02, 8.0, 3
+    FARTHEST, MISFIT_DECAY = 4.0, 10.0
+
+    def __init__(self, spec, tensors):
+        self.spec, self.tensors = spec, tensors
+        self.shape = (spec["frame_height_px"], spec["frame_width_px"])
+
+    def layer(self, name, x):
+        return dense(x, self.tensors, "sprites." + name)
+
+    def convolution(self, name, x, **shape):
+        return conv3(x, self.tensors, "sprites." + name, **shape)
+
+    def predict(self, frames, actions, state):
+        tracks, followed = self.tracks(frames[-1], frames[-2::-1])
+        apart = self.two_ways(tracks, followed, unshuffle(unshuffle(frames[-1][..., None])).sum(2))
+        shares, trust = self.see(frames, tracks, apart)
+        layers = []
+        for sprite in (0, 1):
+            part = frames[-1] * (shares if sprite == 0 else 1 - shares)
+            weight = np.exp(4 * np.tanh(trust[..., sprite] / 4) - apart[..., sprite] ** 2)
+            weight = weight * unshuffle(unshuffle(part[..., None])).sum(2) + 1e-4
+            earlier = (tracks[..., :2] * (weight / weight.sum())[..., None, None]).sum((0, 1))
+            whole = self.whole(frames, part, earlier)
+            moves, widths = self.way(whole, earlier)
+            layers.append([placed(whole, move, width) for move, width in zip(moves, widths)])
+        return [np.clip(one + other - one * other, 0, 1) for one, other in zip(*layers)]
+
+    def see(self, frames, tracks, apart):
+        """The first sprite's share of each pixel of the last frame, and what each block says of the motions."""
+        half = (self.shape[0] // 2, self.shape[1] // 2)
+        columns, rows = np.meshgrid(centred(half[1]), centred(half[0]))
+        inputs = [unshuffle(frame[..., None]) for frame in frames[::-1]] + [columns[..., None], rows[..., None]]
+        first = silu(self.convolution("stem", np.concatenate(inputs, 2).astype(np.float32)))
+        scale = [[1 / (4 * frame), 1 / (4 * frame), 1] for frame in range(1, len(frames))]
+        read = (tracks * np.array(scale)).reshape(tracks.shape[:2] + (-1,))
+        read = np.concatenate([read, apart / self.FARTHEST], 2).astype(np.float32)
+        x = self.convolution("halving", first, stride=2) + self.layer("tracks", read)
+        for block in range(self.spec["sprites"]["encoder_blocks"]):
+            inner = self.convolution(f"encoder.{block}.first", silu(x), dilation=1 << (block % 3))
+            x = x + self.convolution(f"encoder.{block}.second", silu(inner))
+        x = silu(x)
+        fine = self.convolution("fine", np.concatenate([shuffle(self.layer("enlarge", x)), first], 2))
+        logits = shuffle(self.convolution("head", silu(fine)))[..., 0]
+        nearer = np.kron(apart[..., 1] - apart[..., 0], np.ones((4, 4)))
+        return sigmoid(2 * logits + nearer), self.layer("trust", x)
+
+    def tracks(self, frame, others):
+        """How far each block of 4×4 px is in each other frame, to the right and down, and its misfit there; and whether it was followed."""
+        height, width = self.WINDOW
+        border = 4 * width
+        frame, others = np.pad(frame, border), [np.pad(other, border) for other in others]
+        tracks = np.zeros((self.shape[0] // 4, self.shape[1] // 4, len(others), 3), np.float32)
+        followed = np.zeros(tracks.shape[:2], bool)
+        steps = range(-self.REACH, self.REACH + 1)
+        for block in np.ndindex(tracks.shape[:2]):
+            top, left = (4 * block[axis] + 2 + border - self.WINDOW[axis] // 2 for axis in (0, 1))
+            window = frame[top : top + height, left : left + width]
+            energy, before, at = (window**2).sum(), (0, 0), (top, left)
+            followed[block] = energy >= self.LEAST_ENERGY
+            if not followed[block]:
+                continue
+            for index, other in enumerate(others):
+                costs = {}
+                for step in ((down, right) for down in steps for right in steps):
+                    there = (at[0] + step[0], at[1] + step[1])
+                    seen = other[max(there[0], 0) : there[0] + height, max(there[1], 0) : there[1] + width]
+                    if min(there) >= 0 and seen.shape == window.shape:
+                        change = (step[0] - before[0]) ** 2 + (step[1] - before[1]) ** 2
+                        costs[step] = ((seen - window) ** 2).sum() + self.CHANGE_COST * min(change, self.MOST_CHANGE)
+                before = min(costs, key=costs.get)
+                at = (at[0] + before[0], at[1] + before[1])
+                tracks[block][index] = at[1] - left, at[0] - top, min(costs[before] / energy, 1)
+        return tracks, followed
+
+    def two_ways(self, tracks, followed, light):
+        """How far each block went from the way that most others follow, and from the one that most of the rest follow."""
+        apart = np.full(tracks.shape[:2] + (2,), self.FARTHEST)
+        ways, fits = tracks[followed][..., :2], np.exp(-self.MISFIT_DECAY * tracks[followed][..., 2])
+        votes = light[followed] * fits.mean(1)
+        # Row by row, the distances of all blocks to the way of one of them.
+        distances = np.minimum(np.linalg.norm(ways[None] - ways[:, None], axis=3), self.FARTHEST)
+        distances = (distances * fits).sum(2) / (fits.sum(1) + 1e-3)
+        for way in (0, 1):
+            if followed.any():
+                best = distances[(np.exp(-(distances**2)) * votes).sum(1).argmax()]
+                apart[followed, way] = best
+                votes = votes * (1 - np.exp(-(best**2)))
+        return apart
+
+    def whole(self, frames, part, earlier):
+        """A sprite with what the other one hides of it: all frames are laid over each other where it stands still."""
+        followed = [placed(frame, -move, (1, 1)) for frame, move in zip(frames[-2::-1], earlier)]
+        x = unshuffle(np.stack([frames[-1], *followed, part], 2).astype(np.float32))
+        x = self.convolution("content.second", silu(self.convolution("content.first", x)))
+        hidden = sigmoid(shuffle(self.convolution("content.output", silu(x)))[..., 0] - 4)
+        return part + hidden - part * hidden
+
+    def way(self, whole, earlier):
+        """How far a sprite will have moved at each step, to the right and down, and how wide it is spread, in pixels."""
+        units = np.array([self.shape[1], self.shape[0]]) / 4
+        columns, rows = np.meshgrid(np.arange(self.shape[1]), np.arange(self.shape[0]))
+        weight = whole**2
+        middle = np.array([(weight * at).sum() for at in (columns - columns.mean(), rows - rows.mean())]) / (weight.sum() + 1e-3)
+        measured = min(self.SPEED_FRAMES, len(earlier))
+        place = middle / units
+        speed = -5 * earlier[measured - 1] / measured / units
+        known = np.stack([2 * place, 2 * place**2, speed, *(-3 * earlier / units)], 1).astype(np.float32)
+        memory = self.layer("memory.output", silu(self.layer("memory.inputs", known)))
+        moves, widths = [], []
+        for _ in range(self.spec["horizon"]):
+            known = np.concatenate([2 * place[:, None], 2 * speed[:, None], memory], 1).astype(np.float32)
+            told = self.layer("step.output", silu(self.layer("step.hidden", silu(self.layer("step.inputs", known)))))
+            speed = speed + told[:, 0]
+            place = place + (speed + told[:, 1]) / 5
+            memory = memory + told[:, 3:]
+            moves.append(place * units - middle)
+            widths.append(1 + np.logaddexp(0, 2 * told[:, 2] - 2))
+        return moves, widths
+
+
+def placed(picture, move, width):
+    """A picture moved to the right and down by parts of pixels, and spread."""
+    tents = []
+    for axis, side in ((1, picture.shape[0]), (0, picture.shape[1])):
+        distance = np.arange(side)[None] - (np.arange(side)[:, None] - move[axis])
+        tents.append(np.maximum(1 - np.abs(distance) / width[axis], 0) / width[axis])
+    return tents[0] @ picture @ tents[1].T
+
+
 # Files and the comparison.
 
 
@@ -608,6 +744,8 @@ def main():
         predicted = DepthNetwork(spec, tensors).predict(frames, actions, state)
     elif spec.get("architecture", "dense") == "flow":
         predicted = FlowNetwork(spec, tensors).predict(frames, actions, state)
+    elif spec.get("architecture", "dense") == "sprites":
+        predicted = SpriteNetwork(spec, tensors).predict(frames, actions, state)
     else:
         predicted = predict_dense(spec, tensors, frames, actions, state)
     predicted = [(frame * 255 + 0.5).astype(np.uint8) for frame in predicted]

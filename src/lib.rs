@@ -41,7 +41,7 @@ pub use foreframe_core::error_kind::{ErrorKind, HasErrorKind};
 pub use foreframe_core::frame::{Frame, FrameError};
 pub use foreframe_core::nn::{
     Architecture, ArchitectureKind, ChannelScale, Conditioning, DenseSpec, FlowLayers, FlowSpec, ModelSpec, NnError,
-    PredictorOutput, Reconstruction, TensorError,
+    PredictorOutput, Reconstruction, SpriteSpec, TensorError,
 };
 pub use foreframe_core::registry::calibration::{
     Calibration, ContextStatistics, ExpectedError, NoveltyScale, StepErrors, ValueRange,

@@ -75,6 +75,7 @@ mod nn_model;
 mod nn_optimizer;
 mod nn_reference;
 mod nn_spec;
+mod nn_sprites;
 mod openenv;
 mod openpi;
 #[cfg(feature = "otlp")]

@@ -60,7 +60,7 @@ fn small(conditioning: Conditioning, camera: Option<CameraModel>) -> ModelSpec {
 fn flow(spec: &mut ModelSpec) -> &mut FlowSpec {
     match &mut spec.architecture {
         Architecture::Flow(flow) => flow,
-        Architecture::Dense(_) => panic!("the specification is not that of a flow network"),
+        _ => panic!("the specification is not that of a flow network"),
     }
 }
 

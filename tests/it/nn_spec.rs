@@ -12,7 +12,7 @@ use crate::nn_fixtures::{all_kinds, bits, channel, tiny, values};
 fn dense(spec: &mut ModelSpec) -> &mut DenseSpec {
     match &mut spec.architecture {
         Architecture::Dense(dense) => dense,
-        Architecture::Flow(_) => panic!("the specification is not that of a dense network"),
+        _ => panic!("the specification is not that of a dense network"),
     }
 }
 

@@ -78,12 +78,23 @@ fn settings_that_do_not_fit_the_network_or_the_camera_are_refused() {
         (
             "paper",
             "run.optimizer=muon",
-            "run.optimizer is for the flow network only; it must be adam where model.architecture is dense",
+            "run.optimizer is for the flow and sprite networks only; it must be adam where model.architecture is dense",
         ),
         (
             "paper",
             "sequence.short_share=0.5",
             "sequence.short_share is for the flow network only; it must be 0 where model.architecture is dense",
+        ),
+        (
+            "moving-mnist",
+            "sequence={ short_share = 0.5, short_horizon = 6 }",
+            "sequence.short_share is for the flow network only; it must be 0 where model.architecture is sprites",
+        ),
+        (
+            "moving-mnist",
+            "sequence.reconstruction_weight=0",
+            "sequence.reconstruction_weight is 0, but the sprite network learns what the sprites look like from the frames that it sees; \
+             it must be above 0 where model.architecture is sprites",
         ),
         (
             "static-flow",

@@ -4,17 +4,19 @@
 //! a layer, H hidden units of an LSTM, A components of an action, S components of a state. All tensors are f32 and row-major.
 //! Inputs and parameters are on the CPU. Frames are in the model's value range ([`crate::frame::preprocess`]).
 //!
-//! There are two architectures: the paper's in [`dense`] (a codec of single frames, a peephole LSTM that encodes the context,
-//! one LSTM decoder that predicts the next frames and one that reconstructs the context), and [`flow`], which moves the
-//! pixels of the last frame. Neither uses the other. [`network`] is the type that the rest of the program uses for both.
+//! There are three architectures: the paper's in [`dense`] (a codec of single frames, a peephole LSTM that encodes the context,
+//! one LSTM decoder that predicts the next frames and one that reconstructs the context), [`flow`], which moves the
+//! pixels of the last frame, and [`sprites`], which moves two pictures as wholes. None uses another. [`network`] is the type that the rest of the
+//! program uses for all.
 //!
 //! On the CPU, a network computes in fused operations (`ops`). In `plain` and in the folders of that name inside [`dense`] and [`flow`],
-//! the same networks are written in candle's own tensor operations: short to read, and the path of graphics cards ([`device`]).
+//! the same networks are written in candle's own tensor operations: short to read, and the path of graphics cards ([`device`]). The sprite network
+//! always computes on the CPU.
 //! `plain_agreement` tests that both give the same predictions and gradients.
 //!
 //! The modules in reading order; each uses only those above it: `options` (enumerations) → [`error`] → [`device`], [`precision`] →
 //! [`tensors`] → `fused` (what an operation with a gradient of its own is) → `ops` (such operations) → `plain` → [`loss`], [`ssim_loss`], [`mask_loss`] →
-//! [`spec`] (sizes and meaning of a model) → `model_tensors`, `conditioning` (actions and state) → `geometry` (cameras and wheels) → [`dense`], [`flow`] → `model_size` (tensors and cost) → `init`, [`parameters`] →
+//! [`spec`] (sizes and meaning of a model) → `model_tensors`, `conditioning` (actions and state) → `geometry` (cameras and wheels) → [`dense`], [`flow`], [`sprites`] → `model_size` (tensors and cost) → `init`, [`parameters`] →
 //! [`network`]. [`costs`] compares the model's cost with other networks.
 
 mod conditioning;
@@ -41,6 +43,7 @@ mod plain;
 mod plain_agreement;
 pub mod precision;
 pub mod spec;
+pub mod sprites;
 pub mod ssim_loss;
 pub mod tensors;
 
@@ -54,4 +57,4 @@ pub use loss::Loss;
 pub use network::Network;
 pub use options::{ArchitectureKind, Conditioning, PredictorOutput, Reconstruction, UnknownName};
 pub use parameters::Parameters;
-pub use spec::{Architecture, ChannelScale, DenseSpec, FlowLayers, FlowSpec, ModelSpec};
+pub use spec::{Architecture, ChannelScale, DenseSpec, FlowLayers, FlowSpec, ModelSpec, SpriteSpec};

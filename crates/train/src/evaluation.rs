@@ -251,7 +251,7 @@ fn fitted_baselines(evaluation: &EvaluationContext, splits: &Splits) -> Result<B
     {
         baselines = baselines.for_benchmark();
     }
-    if spec.flow().is_some() {
+    if spec.keeps_frames() {
         // Its codes are the frames themselves, so there is no codec to measure.
         baselines = baselines.without(Method::CodecOnly);
     }

@@ -176,7 +176,7 @@ fn initial_parameters(
         return start::parameters(&plan.spec, start, config.seed).map(Some);
     }
     let parameters = Parameters::initialize(&plan.spec, config.seed.derive("weights", 0))?;
-    if plan.spec.flow().is_some() {
+    if plan.spec.keeps_frames() {
         return Ok(Some(parameters));
     }
     let frames = window_frames(&plan.train, config.model.context + config.model.horizon);

@@ -70,6 +70,10 @@ fn network(spec: &ModelSpec) -> String {
                 layers.channels, layers.encoder_blocks, layers.decoder_blocks
             )
         }
+        Architecture::Sprites(sizes) => format!(
+            "two sprites: {} channels, {} encoder blocks; {inverted}",
+            sizes.channels, sizes.encoder_blocks
+        ),
     }
 }
 

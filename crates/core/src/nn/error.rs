@@ -76,6 +76,17 @@ pub enum NnError {
          and heading_sin"
     )]
     Memory,
+    /// The sprite network reads frames alone.
+    #[error(
+        "model specification: the sprite network takes no actions and no state, but the conditioning is \"{conditioning}\"; use \"none\""
+    )]
+    SpriteConditioning {
+        /// The conditioning.
+        conditioning: Conditioning,
+    },
+    /// The sprite network follows motion from frame to frame.
+    #[error("model specification: the sprite network needs a context of 2 frames or more")]
+    SpriteContext,
     /// Two forms of the flow network at once.
     #[error("model specification: flow.recurrent and flow.depth are both true; a network has one of these forms")]
     RecurrentDepth,

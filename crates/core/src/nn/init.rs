@@ -28,7 +28,12 @@ pub(super) fn tensor(name: &str, shape: &[usize], seed: Seed) -> Result<Tensor, 
         ("bias", &[gates]) if is_lstm(name) => lstm_bias(gates),
         ("bias", _) => vec![0.0; count],
         ("weight", &[inputs, outputs]) => {
-            let gain = if name == "predictor.output.weight" { 0.1 } else { 1.0 };
+            let gain = match layer {
+                "predictor.output" => 0.1,
+                "sprites.step.output" => 0.0,
+                _ if layer.starts_with("sprites.encoder.") && layer.ends_with(".second") => 0.0,
+                _ => 1.0,
+            };
             uniform(count, gain * (6.0 / (inputs + outputs) as f32).sqrt(), name, seed)
         }
         (_, &[.., last]) => {

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use super::error::NnError;
 use super::spec::{Architecture, MAX_PARAMETERS, ModelSpec, in_range};
-use super::{dense, flow};
+use super::{dense, flow, sprites};
 
 impl ModelSpec {
     /// Checks the range of every field, and the size of the model. Errors: `OutOfRange`, `NoChannels`, `ChannelScale`,
@@ -25,6 +25,7 @@ impl ModelSpec {
         match &self.architecture {
             Architecture::Dense(sizes) => dense::tensor_shapes(self, sizes),
             Architecture::Flow(sizes) => flow::tensor_shapes(self, sizes),
+            Architecture::Sprites(sizes) => sprites::tensor_shapes(self, sizes),
         }
     }
 
@@ -45,6 +46,7 @@ impl ModelSpec {
         match &self.architecture {
             Architecture::Dense(sizes) => dense::multiply_adds_per_frame(self, sizes),
             Architecture::Flow(sizes) => flow::multiply_adds_per_frame(self, sizes),
+            Architecture::Sprites(sizes) => sprites::multiply_adds_per_frame(self, sizes),
         }
     }
 }

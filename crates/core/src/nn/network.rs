@@ -15,10 +15,11 @@ use super::model_tensors::ModelTensors;
 use super::parameters::{Parameters, of_shape};
 use super::precision::Precision;
 use super::spec::{Architecture, ModelSpec, in_range};
+use super::sprites::{SpriteNetwork, SpritePrediction};
 use super::tensors::with_values;
 
 /// A network that predicts frames. It keeps each frame as a code of [`ModelSpec::code_len`] numbers: the dense network's
-/// features, or for the flow network the frame itself. Holds weights only, so one model serves many.
+/// features, or for the other networks the frame itself. Holds weights only, so one model serves many.
 #[derive(Clone, Debug)]
 pub struct Network {
     spec: ModelSpec,
@@ -29,6 +30,7 @@ pub struct Network {
 enum AnyNetwork {
     Dense(Box<DenseNetwork>),
     Flow(Box<FlowNetwork>),
+    Sprites(Box<SpriteNetwork>),
 }
 
 impl Network {
@@ -58,7 +60,10 @@ impl Network {
     /// The network with its weights on the program's device; the parameters stay on the CPU, and their gradients come back to it.
     fn build(spec: ModelSpec, parameters: &Parameters, frozen: &[&str], always_plain: bool) -> Result<Self, NnError> {
         spec.validate()?;
-        let device = device::current()?;
+        let device = match spec.architecture {
+            Architecture::Dense(_) | Architecture::Flow(_) => device::current()?,
+            Architecture::Sprites(_) => Device::Cpu,
+        };
         let mut tensors = BTreeMap::new();
         for (name, shape) in spec.tensor_shapes() {
             let tensor = of_shape(&name, &shape, parameters.get(&name).map(Var::as_tensor))?;
@@ -70,6 +75,9 @@ impl Network {
         let network = match spec.architecture {
             Architecture::Dense(sizes) => AnyNetwork::Dense(Box::new(DenseNetwork::new(spec.clone(), sizes, &tensors))),
             Architecture::Flow(sizes) => AnyNetwork::Flow(Box::new(FlowNetwork::new(spec.clone(), sizes, &tensors))),
+            Architecture::Sprites(sizes) => {
+                AnyNetwork::Sprites(Box::new(SpriteNetwork::new(spec.clone(), sizes, &tensors)))
+            }
         };
         Ok(Self { spec, network })
     }
@@ -83,6 +91,7 @@ impl Network {
         match &mut self.network {
             AnyNetwork::Flow(flow) => flow.pack(precision)?,
             AnyNetwork::Dense(dense) => dense.pack(precision)?,
+            AnyNetwork::Sprites(sprites) => sprites.pack(precision)?,
         }
         Ok(self)
     }
@@ -104,7 +113,7 @@ impl Network {
         self.check("frames", frames, &[None, Some(self.spec.pixels())])?;
         match &self.network {
             AnyNetwork::Dense(dense) => dense.encode_frames(frames),
-            AnyNetwork::Flow(_) => Ok(frames.clone()),
+            AnyNetwork::Flow(_) | AnyNetwork::Sprites(_) => Ok(frames.clone()),
         }
     }
 
@@ -113,7 +122,7 @@ impl Network {
         self.check("features", codes, &[None, Some(self.spec.code_len())])?;
         match &self.network {
             AnyNetwork::Dense(dense) => dense.decode_frames(codes),
-            AnyNetwork::Flow(_) => Ok(codes.clone()),
+            AnyNetwork::Flow(_) | AnyNetwork::Sprites(_) => Ok(codes.clone()),
         }
     }
 
@@ -151,12 +160,13 @@ impl Network {
                 let asked = Asked::frames(self.spec.horizon);
                 Ok(flow.predict(codes, windows, conditioning, asked)?.frames)
             }
+            AnyNetwork::Sprites(sprites) => sprites.predict_rollouts(codes, windows, self.spec.horizon),
         }
     }
 
     /// As [`Network::predict_rollouts`], `steps` frames instead of the horizon; the conditioning has as many actions. Up to the
     /// horizon the frames are those of [`Network::predict_rollouts`] with the last action held. Beyond it, which no training saw,
-    /// the dense network goes on step by step; the flow network starts again from the frames that it predicted.
+    /// the dense network goes on step by step; the other networks start again from the frames that they predicted.
     /// Errors: `Shape`, `Missing`, `Tensor` if there is no such window.
     pub fn predict_steps(
         &self,
@@ -172,6 +182,7 @@ impl Network {
         match &self.network {
             AnyNetwork::Dense(dense) => dense.with_horizon(steps).predict_rollouts(codes, windows, conditioning),
             AnyNetwork::Flow(flow) => flow.predict_beyond_horizon(codes, windows, conditioning, steps),
+            AnyNetwork::Sprites(sprites) => sprites.predict_rollouts(codes, windows, steps),
         }
     }
 
@@ -186,11 +197,20 @@ impl Network {
         let batch = self.check_windows(frames)?;
         in_range("steps", steps as f64, 1.0, self.spec.horizon as f64)?;
         match &self.network {
-            AnyNetwork::Dense(_) => Ok(None),
+            AnyNetwork::Dense(_) | AnyNetwork::Sprites(_) => Ok(None),
             AnyNetwork::Flow(flow) => {
                 let asked = Asked::all(steps);
                 flow.predict(frames, &each_once(batch), conditioning, asked).map(Some)
             }
+        }
+    }
+
+    /// All that the sprite network gives for frames `[B, context, P]`; `None` of another architecture. Errors: `Shape`.
+    pub fn predict_sprites(&self, frames: &Tensor) -> Result<Option<SpritePrediction>, NnError> {
+        self.check_windows(frames)?;
+        match &self.network {
+            AnyNetwork::Sprites(sprites) => sprites.predict(frames, self.spec.horizon).map(Some),
+            AnyNetwork::Dense(_) | AnyNetwork::Flow(_) => Ok(None),
         }
     }
 
@@ -212,7 +232,7 @@ impl Network {
         let measured = channels.measured_in(state);
         let speeds = plans.map(|plan| channels.speeds(measured, plan, count)).collect();
         let learned = match &self.network {
-            AnyNetwork::Dense(_) => None,
+            AnyNetwork::Dense(_) | AnyNetwork::Sprites(_) => None,
             AnyNetwork::Flow(flow) => flow.wheels(),
         };
         let wheels = match learned {
@@ -236,7 +256,7 @@ impl Network {
     ) -> Result<Option<Vec<Occupancy>>, NnError> {
         self.check_windows(codes)?;
         match &self.network {
-            AnyNetwork::Dense(_) => Ok(None),
+            AnyNetwork::Dense(_) | AnyNetwork::Sprites(_) => Ok(None),
             AnyNetwork::Flow(flow) => flow.occupancy(codes, conditioning),
         }
     }
@@ -247,7 +267,7 @@ impl Network {
         self.check_windows(codes)?;
         match &self.network {
             AnyNetwork::Dense(dense) => dense.reconstruct(codes).map(Some),
-            AnyNetwork::Flow(_) => Ok(None),
+            AnyNetwork::Flow(_) | AnyNetwork::Sprites(_) => Ok(None),
         }
     }
 

@@ -51,11 +51,13 @@ pub(in crate::nn) use named_enum;
 named_enum!(
     /// The kind of network.
     #[cfg_attr(feature = "schema", schema(as = Architecture))]
-    ArchitectureKind, "architecture", "\"dense\" and \"flow\"", {
+    ArchitectureKind, "architecture", "\"dense\", \"flow\" and \"sprites\"", {
         /// The paper's: a dense codec and LSTMs.
         Dense = "dense",
         /// A convolutional network that moves the pixels of the last frame.
         Flow = "flow",
+        /// A network that moves two pictures, each as a whole.
+        Sprites = "sprites",
     }
 );
 

@@ -101,9 +101,10 @@ impl Parameters {
 /// The architecture that these tensors belong to, if their names show it.
 fn architecture_of(tensors: &BTreeMap<String, Tensor>) -> Option<ArchitectureKind> {
     let has = |prefix: &str| tensors.keys().any(|name| name.starts_with(prefix));
-    match (has("flow."), has("frame_encoder.")) {
-        (true, false) => Some(ArchitectureKind::Flow),
-        (false, true) => Some(ArchitectureKind::Dense),
+    match (has("flow."), has("frame_encoder."), has("sprites.")) {
+        (true, false, false) => Some(ArchitectureKind::Flow),
+        (false, true, false) => Some(ArchitectureKind::Dense),
+        (false, false, true) => Some(ArchitectureKind::Sprites),
         _ => None,
     }
 }

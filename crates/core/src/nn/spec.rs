@@ -7,6 +7,7 @@ mod flow;
 mod json;
 mod limits;
 mod model;
+mod sprites;
 
 pub use channels::{ChannelScale, MIN_CHANNEL_STD};
 pub use dense::DenseSpec;
@@ -17,3 +18,4 @@ pub use limits::{
     MAX_STEPS, MIN_FRAME_PERIOD_S,
 };
 pub use model::{Architecture, ModelSpec};
+pub use sprites::SpriteSpec;

@@ -172,6 +172,8 @@ fn cgroup_bytes() -> Option<u64> {
 
 /// Values that the flow network keeps for each pixel of a window's frames until the gradients are computed.
 const FLOW_PIXEL_VALUES: u64 = 60;
+/// The same of the sprite network.
+const SPRITE_PIXEL_VALUES: u64 = 40;
 
 /// The least memory that a training on a data set needs, in MiB, if it holds at most `held_mib` MiB of frames. It leaves out
 /// what is hard to know, so a training that passes this check can still reach its limit.
@@ -190,6 +192,7 @@ fn training_mib(config: &TrainConfig, dataset: &DatasetInfo, held_mib: u64) -> u
         }
         // Its weights are few beside its activations.
         ArchitectureConfig::Flow(_) => (0, 0, FLOW_PIXEL_VALUES * pixels),
+        ArchitectureConfig::Sprites(_) => (0, 0, SPRITE_PIXEL_VALUES * pixels),
     };
     let weights = VALUE * WEIGHT_COPIES * weights;
     let window = count(config.model.context + config.model.horizon);

@@ -145,9 +145,9 @@ pub struct SequenceConfig {
     /// What the predictor gets as the previous frame in training, after its first step.
     pub feedback: TrainingFeedback,
     /// Weight of the reconstruction loss; the prediction loss has weight 1. With 0, the reconstruction decoder is not
-    /// trained.
+    /// trained. The sprite network learns what its sprites look like from this loss, so there it must be above 0.
     pub reconstruction_weight: f64,
-    /// Weight of the similarity loss (flow network): 1 minus the structural similarity of the predicted frames.
+    /// Weight of the similarity loss (flow and sprite networks): 1 minus the structural similarity of the predicted frames.
     #[serde(default)]
     pub ssim_weight: f64,
     /// In this share of the updates, the first ones, the frame and SSIM losses count only the first `short_horizon` predicted
@@ -160,8 +160,9 @@ pub struct SequenceConfig {
     /// Weight of the scene loss (flow network): the difference between the scene alone and the true frames.
     #[serde(default)]
     pub scene_weight: f64,
-    /// Weight of the motion loss (flow network): the difference between the predicted camera motion and the motion between
-    /// the measured poses, if the states have a pose.
+    /// Weight of the motion loss. Flow network: the difference between the predicted camera motion and the motion between the
+    /// measured poses, if the states have a pose. Sprite network: the distance, in pixels, between where sprites are predicted and where
+    /// their blocks go.
     #[serde(default)]
     pub motion_weight: f64,
     /// Weight of the loss of movers (flow network with `movers`): the cross entropy of where they are and will be.
@@ -222,7 +223,7 @@ pub enum TrainingFeedback {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RunConfig {
-    /// How weights are updated: `"adam"`, or `"muon"` (flow network).
+    /// How weights are updated: `"adam"`, or `"muon"` (flow and sprite networks).
     #[serde(default)]
     pub optimizer: UpdateRule,
     /// Updates over which the learning rate rises from 0.
@@ -321,6 +322,7 @@ impl TrainConfig {
                     layers,
                     camera: info.camera,
                 }),
+                ArchitectureConfig::Sprites(sprites) => Architecture::Sprites(sprites),
             },
             frame_width_px: info.frame_width_px,
             frame_height_px: info.frame_height_px,

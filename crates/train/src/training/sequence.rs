@@ -12,6 +12,7 @@ use super::stage::{BatchPart, Objective};
 use foreframe_core::frame::Frame;
 use foreframe_core::nn::loss::Loss;
 use foreframe_core::nn::mask_loss::mask_loss;
+use foreframe_core::nn::sprites::motion_loss;
 use foreframe_core::nn::ssim_loss::ssim_loss;
 use foreframe_core::nn::{Feedback, Network, NnError, Parameters};
 
@@ -49,6 +50,18 @@ impl<'a> SequenceObjective<'a> {
         Ok(features.reshape((batch, time, self.plan.spec.code_len()))?)
     }
 
+    /// The loss of predicted frames `[B, T, P]`, with that of their similarity.
+    fn frames_loss(&self, predicted: &Tensor, targets: &Tensor) -> Result<Tensor, TrainError> {
+        let sequence = &self.config.sequence;
+        let loss = sequence.loss.between(predicted, targets)?;
+        if sequence.ssim_weight == 0.0 {
+            return Ok(loss);
+        }
+        let width = self.plan.spec.frame_width_px as usize;
+        let similarity = ssim_loss(predicted, targets, width)?;
+        Ok((loss + (similarity * sequence.ssim_weight)?)?)
+    }
+
     /// The flow network's loss: of the frames, of the scene alone, and of the camera's motion where poses are measured.
     /// In the frame and SSIM losses, only the first `counting` frames count.
     fn flow_loss(&self, model: &Network, batch: &WindowBatch, counting: usize) -> Result<Tensor, TrainError> {
@@ -57,12 +70,7 @@ impl<'a> SequenceObjective<'a> {
             return Err(TrainError::Config("only the flow network has this loss".to_owned()));
         };
         let targets = batch.targets.narrow(1, 0, counting)?.contiguous()?;
-        let mut loss = sequence.loss.between(&predicted.frames, &targets)?;
-        if sequence.ssim_weight > 0.0 {
-            let width = self.plan.spec.frame_width_px as usize;
-            let similarity = ssim_loss(&predicted.frames, &targets, width)?;
-            loss = (loss + (similarity * sequence.ssim_weight)?)?;
-        }
+        let mut loss = self.frames_loss(&predicted.frames, &targets)?;
         if let Some(scene) = predicted.scene.filter(|_| sequence.scene_weight > 0.0) {
             let truth = batch.targets.narrow(1, 0, scene.dim(1)?)?.contiguous()?;
             let scene = sequence.loss.between(&scene, &truth)?;
@@ -85,6 +93,20 @@ impl<'a> SequenceObjective<'a> {
             loss = added(loss, sequence.speeds_weight, speeds, &truth, squared)?;
         }
         Ok(loss)
+    }
+
+    /// The sprite network's loss: of the frames to come, of the context's frames as the sprites show them, and of the way that the
+    /// sprites go.
+    fn sprite_loss(&self, model: &Network, batch: &WindowBatch) -> Result<Tensor, TrainError> {
+        let sequence = &self.config.sequence;
+        let Some(predicted) = model.predict_sprites(&batch.inputs)? else {
+            return Err(TrainError::Config("only the sprite network has this loss".to_owned()));
+        };
+        let coming = self.frames_loss(&predicted.frames, &batch.targets)?;
+        let context = sequence.loss.between(&predicted.context, &batch.input_targets)?;
+        let motion = motion_loss(&self.plan.spec, &predicted, &batch.input_targets, &batch.targets)?;
+        let loss = (coming + (context * sequence.reconstruction_weight)?)?;
+        Ok((loss + (motion * sequence.motion_weight)?)?)
     }
 
     /// Decodes features `[B, T, F]` to frames `[B, T, P]`.
@@ -156,6 +178,9 @@ impl Objective for SequenceObjective<'_> {
         if self.plan.spec.flow().is_some() {
             let counting = sequence.frames_that_count(step, self.plan.spec.horizon);
             return self.flow_loss(&model, &batch, counting);
+        }
+        if self.plan.spec.sprites().is_some() {
+            return self.sprite_loss(&model, &batch);
         }
         let inputs = self.features(&model, &batch.inputs)?;
         let true_features = batch

@@ -101,19 +101,23 @@ impl FlowSpec {
         if self.layers.speeds && !self.layers.depth {
             return Err(NnError::SpeedsDepth);
         }
-        let [least, most] = SIDES_PX;
-        let fits = |side: u32| (least..=most).contains(&side) && side.is_multiple_of(least);
-        let [width, height] = sides_px;
-        if fits(width) && fits(height) {
-            return Ok(());
-        }
-        Err(NnError::FrameSides {
-            width,
-            height,
-            min: least,
-            max: most,
-        })
+        check_sides(sides_px)
     }
+}
+
+/// Errors: `FrameSides` if frames of this width and height cannot be cut into blocks of 4×4 pixels, or are too large.
+pub(super) fn check_sides([width, height]: [u32; 2]) -> Result<(), NnError> {
+    let [min, max] = SIDES_PX;
+    let fits = |side: u32| (min..=max).contains(&side) && side.is_multiple_of(min);
+    if fits(width) && fits(height) {
+        return Ok(());
+    }
+    Err(NnError::FrameSides {
+        width,
+        height,
+        min,
+        max,
+    })
 }
 
 impl FlowLayers {

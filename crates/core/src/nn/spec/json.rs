@@ -1,5 +1,5 @@
 //! The JSON form of a specification: one object, in which the fields of a network stand beside those of all models. When it
-//! is read, the fields of the other network are ignored; they are not written.
+//! is read, the fields of the other networks are ignored; they are not written.
 
 use serde::de::Error as _;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
@@ -8,6 +8,7 @@ use super::channels::ChannelScale;
 use super::dense::DenseSpec;
 use super::flow::{FlowLayers, FlowSpec};
 use super::model::{Architecture, ModelSpec};
+use super::sprites::SpriteSpec;
 use crate::frame::preprocess::Preprocess;
 use crate::frame::warp::CameraModel;
 use crate::nn::options::{ArchitectureKind, Conditioning, PredictorOutput, Reconstruction};
@@ -36,19 +37,19 @@ struct ModelSpecJson {
     context: usize,
     /// Number of predicted frames.
     horizon: usize,
-    /// Features of a frame, F; absent for the flow network.
+    /// Features of a frame, F; absent for the other networks.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "schema", schema(nullable = false))]
     features: Option<usize>,
-    /// Hidden units of each LSTM, H; absent for the flow network.
+    /// Hidden units of each LSTM, H; absent for the other networks.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "schema", schema(nullable = false))]
     hidden: Option<usize>,
-    /// How the context frames are reconstructed; absent for the flow network.
+    /// How the context frames are reconstructed; absent for the other networks.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "schema", schema(nullable = false))]
     reconstruction: Option<Reconstruction>,
-    /// What the predictor gives at each step; absent for the flow network.
+    /// What the predictor gives at each step; absent for the other networks.
     #[serde(
         default = "PredictorOutput::residual",
         skip_serializing_if = "PredictorOutput::is_residual"
@@ -60,9 +61,12 @@ struct ModelSpecJson {
     actions: Vec<ChannelScale>,
     /// Components of a state in the training data; used only if `conditioning` includes the state.
     states: Vec<ChannelScale>,
-    /// Layer sizes of the flow network; absent for the dense network.
+    /// Layer sizes of the flow network; absent for the other networks.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     flow: Option<FlowLayers>,
+    /// Layer sizes of the sprite network; absent for the other networks.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    sprites: Option<SpriteSpec>,
     /// The camera model, if it is known. Only the flow network uses it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     camera: Option<CameraModel>,
@@ -87,6 +91,7 @@ impl ModelSpecJson {
             actions: spec.actions.clone(),
             states: spec.states.clone(),
             flow: flow.map(|flow| flow.layers),
+            sprites: spec.sprites().copied(),
             camera: flow.and_then(|flow| flow.camera),
         }
     }
@@ -104,6 +109,7 @@ impl ModelSpecJson {
                 layers: self.flow.unwrap_or_default(),
                 camera: self.camera,
             }),
+            ArchitectureKind::Sprites => Architecture::Sprites(self.sprites.unwrap_or_default()),
         })
     }
 }

@@ -6,6 +6,7 @@ use super::flow::FlowSpec;
 use super::limits::{
     MAX_BLUR_SIGMA_PX, MAX_CHANNELS, MAX_FRAME_PERIOD_S, MAX_MODEL_SIDE_PX, MAX_STEPS, MIN_FRAME_PERIOD_S, in_range,
 };
+use super::sprites::SpriteSpec;
 use crate::frame::preprocess::Preprocess;
 use crate::nn::error::NnError;
 use crate::nn::ops::sampling::ImageSize;
@@ -18,6 +19,8 @@ pub enum Architecture {
     Dense(DenseSpec),
     /// A convolutional network that moves the pixels of the last frame.
     Flow(FlowSpec),
+    /// A network that moves two pictures, each as a whole.
+    Sprites(SpriteSpec),
 }
 
 impl Architecture {
@@ -27,6 +30,7 @@ impl Architecture {
         match self {
             Self::Dense(_) => ArchitectureKind::Dense,
             Self::Flow(_) => ArchitectureKind::Flow,
+            Self::Sprites(_) => ArchitectureKind::Sprites,
         }
     }
 }
@@ -79,7 +83,7 @@ impl ModelSpec {
     pub fn dense(&self) -> Option<&DenseSpec> {
         match &self.architecture {
             Architecture::Dense(dense) => Some(dense),
-            Architecture::Flow(_) => None,
+            Architecture::Flow(_) | Architecture::Sprites(_) => None,
         }
     }
 
@@ -87,8 +91,17 @@ impl ModelSpec {
     #[must_use]
     pub fn flow(&self) -> Option<&FlowSpec> {
         match &self.architecture {
-            Architecture::Dense(_) => None,
             Architecture::Flow(flow) => Some(flow),
+            Architecture::Dense(_) | Architecture::Sprites(_) => None,
+        }
+    }
+
+    /// The sizes of the sprite network; `None` for another architecture.
+    #[must_use]
+    pub fn sprites(&self) -> Option<&SpriteSpec> {
+        match &self.architecture {
+            Architecture::Sprites(sprites) => Some(sprites),
+            Architecture::Dense(_) | Architecture::Flow(_) => None,
         }
     }
 
@@ -98,20 +111,20 @@ impl ModelSpec {
         self.frame_width_px as usize * self.frame_height_px as usize
     }
 
-    /// Number of values that the model keeps of each frame: the features for the dense network, the pixels for the flow
-    /// network.
+    /// Number of values that the model keeps of each frame: the features for the dense network, the pixels for the other
+    /// networks.
     #[must_use]
     pub fn code_len(&self) -> usize {
         match &self.architecture {
             Architecture::Dense(dense) => dense.features,
-            Architecture::Flow(_) => self.pixels(),
+            Architecture::Flow(_) | Architecture::Sprites(_) => self.pixels(),
         }
     }
 
     /// Whether the code of a frame is the frame itself, in the model's value range.
     #[must_use]
-    pub(crate) fn keeps_frames(&self) -> bool {
-        matches!(self.architecture, Architecture::Flow(_))
+    pub fn keeps_frames(&self) -> bool {
+        !matches!(self.architecture, Architecture::Dense(_))
     }
 
     /// Height and width of a frame.
@@ -178,6 +191,10 @@ impl ModelSpec {
                     return Err(NnError::Memory);
                 }
                 Ok(())
+            }
+            Architecture::Sprites(sprites) => {
+                let sides = [self.frame_width_px, self.frame_height_px];
+                sprites.check(self.conditioning, self.context, sides)
             }
         }
     }

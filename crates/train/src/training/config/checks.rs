@@ -86,20 +86,27 @@ impl TrainConfig {
     fn validate_together(&self) -> Result<(), TrainError> {
         let (run, sequence) = (&self.run, &self.sequence);
         let architecture = self.model.architecture.kind();
-        if architecture == ArchitectureKind::Dense {
-            let dense_needs = [
-                ("run.optimizer", run.optimizer == UpdateRule::Muon, "adam"),
-                ("sequence.short_share", sequence.short_share > 0.0, "0"),
-            ];
-            if let Some((field, _, needed)) = dense_needs.iter().find(|(_, is_set, _)| *is_set) {
-                return refused(format!(
-                    "{field} is for the flow network only; it must be {needed} where model.architecture is dense"
-                ));
-            }
-        }
-        if architecture == ArchitectureKind::Flow && self.pretrain.steps > 0 {
+        let uses_muon = run.optimizer == UpdateRule::Muon && architecture == ArchitectureKind::Dense;
+        let counts_few = sequence.short_share > 0.0 && architecture != ArchitectureKind::Flow;
+        let of_others = [
+            ("run.optimizer", uses_muon, "the flow and sprite networks", "adam"),
+            ("sequence.short_share", counts_few, "the flow network", "0"),
+        ];
+        if let Some((field, _, networks, needed)) = of_others.iter().find(|(_, is_set, _, _)| *is_set) {
             return refused(format!(
-                "pretrain.steps is {}; the flow network has no pre-training, so it must be 0",
+                "{field} is for {networks} only; it must be {needed} where model.architecture is {architecture}"
+            ));
+        }
+        if architecture == ArchitectureKind::Sprites && sequence.reconstruction_weight == 0.0 {
+            return refused(
+                "sequence.reconstruction_weight is 0, but the sprite network learns what the sprites look like from the frames that it sees; \
+                 it must be above 0 where model.architecture is sprites"
+                    .to_owned(),
+            );
+        }
+        if architecture != ArchitectureKind::Dense && self.pretrain.steps > 0 {
+            return refused(format!(
+                "pretrain.steps is {}; only the dense network has pre-training, so it must be 0",
                 self.pretrain.steps
             ));
         }

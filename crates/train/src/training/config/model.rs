@@ -3,7 +3,9 @@
 use serde::{Deserialize, Serialize};
 
 use foreframe_core::frame::preprocess::Preprocess;
-use foreframe_core::nn::{ArchitectureKind, Conditioning, DenseSpec, FlowLayers, PredictorOutput, Reconstruction};
+use foreframe_core::nn::{
+    ArchitectureKind, Conditioning, DenseSpec, FlowLayers, PredictorOutput, Reconstruction, SpriteSpec,
+};
 
 /// Settings of the network. The other values of the [`ModelSpec`](foreframe_core::nn::ModelSpec) come from the data set.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -28,6 +30,8 @@ pub enum ArchitectureConfig {
     Dense(DenseSpec),
     /// A convolutional network that moves the pixels of the last frame.
     Flow(FlowLayers),
+    /// A network that moves two pictures, each as a whole.
+    Sprites(SpriteSpec),
 }
 
 impl ArchitectureConfig {
@@ -37,11 +41,12 @@ impl ArchitectureConfig {
         match self {
             Self::Dense(_) => ArchitectureKind::Dense,
             Self::Flow(_) => ArchitectureKind::Flow,
+            Self::Sprites(_) => ArchitectureKind::Sprites,
         }
     }
 }
 
-/// The written form: one table, in which the sizes of both networks stand beside what is common. Only those of the network that
+/// The written form: one table, in which the sizes of all networks stand beside what is common. Only those of the network that
 /// `architecture` names count, so that `--set model.architecture=flow` can change the
 /// network of a preset.
 #[derive(Serialize, Deserialize)]
@@ -63,6 +68,8 @@ struct ModelSettings {
     preprocess: Preprocess,
     #[serde(default, skip_serializing_if = "Option::is_none")]
     flow: Option<FlowLayers>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    sprites: Option<SpriteSpec>,
 }
 
 fn default_features() -> usize {
@@ -87,6 +94,7 @@ impl From<ModelSettings> for ModelConfig {
                 predictor_output: settings.predictor_output,
             }),
             ArchitectureKind::Flow => ArchitectureConfig::Flow(settings.flow.unwrap_or_default()),
+            ArchitectureKind::Sprites => ArchitectureConfig::Sprites(settings.sprites.unwrap_or_default()),
         };
         Self {
             architecture,
@@ -100,9 +108,10 @@ impl From<ModelSettings> for ModelConfig {
 
 impl From<ModelConfig> for ModelSettings {
     fn from(config: ModelConfig) -> Self {
-        let (dense, flow) = match config.architecture {
-            ArchitectureConfig::Dense(dense) => (dense, None),
-            ArchitectureConfig::Flow(layers) => (DenseSpec::default(), Some(layers)),
+        let (dense, flow, sprites) = match config.architecture {
+            ArchitectureConfig::Dense(dense) => (dense, None, None),
+            ArchitectureConfig::Flow(layers) => (DenseSpec::default(), Some(layers), None),
+            ArchitectureConfig::Sprites(sprites) => (DenseSpec::default(), None, Some(sprites)),
         };
         Self {
             architecture: config.architecture.kind(),
@@ -115,6 +124,7 @@ impl From<ModelConfig> for ModelSettings {
             conditioning: config.conditioning,
             preprocess: config.preprocess,
             flow,
+            sprites,
         }
     }
 }

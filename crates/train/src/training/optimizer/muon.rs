@@ -17,18 +17,29 @@ const UPDATE_SIZE: f64 = 0.2;
 /// Keeps a momentum of zeros at zero.
 const LEAST_NORM: f64 = 1e-12;
 /// Layers of the flow network that are not hidden layers of its convolutional part.
-const OTHER_LAYERS: [&str; 5] = [
+const OTHER_FLOW_LAYERS: [&str; 5] = [
     "flow.scene.",
     "flow.motion.",
     "flow.modulation.",
     "flow.affine.",
     "flow.head.",
 ];
+/// Layers of the sprite network: the hidden ones of its convolutional part, and those of its motion.
+const SPRITE_LAYERS: [&str; 7] = [
+    "sprites.halving.",
+    "sprites.encoder.",
+    "sprites.fine.",
+    "sprites.content.first.",
+    "sprites.content.second.",
+    "sprites.memory.",
+    "sprites.step.",
+];
 
-/// Whether Muon updates the tensor of that name: weights of the flow network's hidden layers. Adam updates the others.
+/// Whether Muon updates the tensor of that name: weights of most layers. Adam updates the others.
 pub(super) fn applies_to(name: &str) -> bool {
-    let is_other = OTHER_LAYERS.iter().any(|layer| name.starts_with(layer));
-    name.starts_with("flow.") && name.ends_with(".weight") && !is_other
+    let is_one_of = |layers: &[&str]| layers.iter().any(|layer| name.starts_with(layer));
+    let is_hidden = is_one_of(&SPRITE_LAYERS) || name.starts_with("flow.") && !is_one_of(&OTHER_FLOW_LAYERS);
+    is_hidden && name.ends_with(".weight")
 }
 
 /// Updates a weight `[inputs, outputs]` and its momentum. The gradient is multiplied by `scale` first.
@@ -120,7 +131,7 @@ mod tests {
     }
 
     #[test]
-    fn hidden_layers_of_the_flow_network_only() {
+    fn hidden_layers_of_flow_and_sprite_networks_only() {
         for name in [
             "stem",
             "encoder.0.first",
@@ -135,6 +146,20 @@ mod tests {
         }
         for name in ["scene.hidden", "motion.output", "modulation.inputs", "affine", "head"] {
             assert!(!applies_to(&format!("flow.{name}.weight")), "{name}");
+        }
+        for name in [
+            "halving",
+            "encoder.0.first",
+            "fine",
+            "content.second",
+            "memory.inputs",
+            "step.output",
+        ] {
+            assert!(applies_to(&format!("sprites.{name}.weight")), "{name}");
+            assert!(!applies_to(&format!("sprites.{name}.bias")), "{name}");
+        }
+        for name in ["stem", "head", "content.output", "trust", "tracks", "enlarge"] {
+            assert!(!applies_to(&format!("sprites.{name}.weight")), "{name}");
         }
         assert!(!applies_to("predictor.output.weight"));
     }
