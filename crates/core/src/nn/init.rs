@@ -6,6 +6,7 @@
 //! - LSTM weights and peepholes: uniform ±1/√H; biases 0, the forget gate's 1 (Jozefowicz et al. 2015).
 //! - The flow network's weights: the linear range, or a share of it (`flow_gain`); its other tensors 0.
 //! - `predictor.output.weight`: a tenth of the linear range, so that an untrained model predicts almost no change.
+//! - `sprites.step.output.weight` and the second layers of the sprite network's encoder: 0, so that at first everything goes straight on.
 
 use candle_core::{Device, Tensor};
 use rand::Rng;

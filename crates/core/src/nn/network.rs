@@ -205,11 +205,11 @@ impl Network {
         }
     }
 
-    /// All that the sprite network gives for frames `[B, context, P]`; `None` of another architecture. Errors: `Shape`.
+    /// All that the sprite network learns from, of frames `[B, context, P]`; `None` of another architecture. Errors: `Shape`.
     pub fn predict_sprites(&self, frames: &Tensor) -> Result<Option<SpritePrediction>, NnError> {
         self.check_windows(frames)?;
         match &self.network {
-            AnyNetwork::Sprites(sprites) => sprites.predict(frames, self.spec.horizon).map(Some),
+            AnyNetwork::Sprites(sprites) => sprites.predict(frames).map(Some),
             AnyNetwork::Dense(_) | AnyNetwork::Flow(_) => Ok(None),
         }
     }

@@ -3,7 +3,7 @@
 use candle_core::{Result, Tensor};
 
 use super::lstm_cell::{Decoder, DecoderInputs, LstmState, PeepholeCell};
-use crate::nn::plain::layers::linear;
+use crate::nn::plain::layers::{linear, sigmoid};
 
 /// One step from the sums of the inputs and the bias, `[B, 4H]`.
 fn step(cell: &PeepholeCell, inputs: &Tensor, state: &LstmState) -> Result<LstmState> {
@@ -17,11 +17,6 @@ fn step(cell: &PeepholeCell, inputs: &Tensor, state: &LstmState) -> Result<LstmS
     let c = ((f * &state.c)? + (i * part(2)?.tanh()?)?)?;
     let o = gate(part(3)?, w_o, &c)?;
     Ok(LstmState { h: (o * c.tanh()?)?, c })
-}
-
-/// σ(x) = (1 + tanh(x / 2)) / 2, of operations that have gradients.
-fn sigmoid(x: &Tensor) -> Result<Tensor> {
-    x.affine(0.5, 0.0)?.tanh()?.affine(0.5, 0.5)
 }
 
 /// The contribution of inputs `[B, T, D]` to the sums, and the bias, step by step: `[T, B, 4H]`. `first_row`: of the input weights.

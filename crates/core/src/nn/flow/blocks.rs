@@ -15,11 +15,6 @@ pub(super) const MOVED_CHANNELS: usize = 5;
 /// Of these, the channels that hold pixels.
 pub(super) const BLOCK_PIXELS: usize = MOVED_CHANNELS - 1;
 
-/// A column or row as −1 to 1.
-pub(super) fn centred(at: usize, side: usize) -> f32 {
-    (2.0 * at as f32 + 1.0) / side as f32 - 1.0
-}
-
 /// An item's places on the grid of a quarter of the sides `[H/4, W/4, 2]`, as the means of the middles of their 4×4 blocks.
 pub(super) fn coarse_places(places: PixelPlaces, size: ImageSize) -> Vec<f32> {
     let quarter = size.shrunk(4);

@@ -9,12 +9,11 @@
 use candle_core::{Device, Result, Tensor};
 use rayon::prelude::*;
 
-use super::blocks::centred;
 use super::encoder_views::EncoderViews;
 use crate::frame::warp::CameraModel;
 use crate::nn::geometry::camera::{Viewer, ViewerRays, rotated};
 use crate::nn::ops::gathering::{OfPlaces, SAMPLED_TOGETHER, read_together, write_together};
-use crate::nn::ops::sampling::{ImageSize, SampledImage};
+use crate::nn::ops::sampling::{ImageSize, SampledImage, centred};
 use crate::vectorized::vectorized_by;
 
 /// Distance of everything that the floor does not explain, before anything is learned.

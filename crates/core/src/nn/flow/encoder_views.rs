@@ -1,10 +1,10 @@
 //! The contexts that the encoder reads, in the view of their last frames.
 
-use super::blocks::{centred, write_blocks};
+use super::blocks::write_blocks;
 use crate::frame::warp::CameraModel;
 use crate::nn::geometry::camera::{CameraPose, Viewer};
 use crate::nn::geometry::state_channels::StateChannels;
-use crate::nn::ops::sampling::{PixelPlaces, own_places};
+use crate::nn::ops::sampling::{PixelPlaces, centred, own_places};
 use crate::nn::spec::ModelSpec;
 
 /// The contexts that are encoded, each once.

@@ -6,7 +6,7 @@
 
 use candle_core::{DType, Device, Tensor};
 
-use super::blocks::{centred, content_blocks};
+use super::blocks::content_blocks;
 use super::encoder_views::EncoderViews;
 use super::rollout_rows::RolloutRows;
 use super::room_geometry::{RAY_VALUES, RoomScale, RoomSides, RoomViews, ViewInRoom};
@@ -18,7 +18,7 @@ use crate::nn::model_tensors::ModelTensors;
 use crate::nn::ops::compose::SCENE_CHANNELS;
 use crate::nn::ops::linear::Linear;
 use crate::nn::ops::modulation::perceptron;
-use crate::nn::ops::sampling::ImageSize;
+use crate::nn::ops::sampling::{ImageSize, centred};
 use crate::nn::precision::Precision;
 use crate::nn::spec::{MIN_CHANNEL_STD, ModelSpec};
 use crate::nn::tensors::with_values;

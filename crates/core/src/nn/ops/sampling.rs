@@ -72,6 +72,11 @@ impl ImageSize {
     }
 }
 
+/// A column or row as −1 to 1.
+pub(in crate::nn) fn centred(at: usize, side: usize) -> f32 {
+    (2.0 * at as f32 + 1.0) / side as f32 - 1.0
+}
+
 /// A place for each pixel of an image, as columns and rows.
 #[derive(Clone, Copy)]
 pub(in crate::nn) enum PixelPlaces<'a> {

@@ -59,3 +59,8 @@ pub(in crate::nn) fn pixel_unshuffle(x: &Tensor) -> Result<Tensor> {
         .permute(vec![0, 3, 5, 1, 2, 4])?
         .reshape((items, 4 * channels, height / 2, width / 2))
 }
+
+/// σ(x) = (1 + tanh(x / 2)) / 2, of operations that have gradients. No exponent overflows.
+pub(in crate::nn) fn sigmoid(x: &Tensor) -> Result<Tensor> {
+    x.affine(0.5, 0.0)?.tanh()?.affine(0.5, 0.5)
+}

@@ -15,12 +15,12 @@ pub(super) const AXES: usize = 2;
 pub(super) const STEP_VALUES: usize = 3;
 
 /// Numbers that describe a sprite's way so far along an axis: its middle and the square of that, its last speed, and its places.
-pub(super) fn way_values(context: usize) -> usize {
+fn way_values(context: usize) -> usize {
     3 + (context - 1)
 }
 
 /// Channels of the encoder's inputs on half the sides: blocks of 2×2 pixels of the frames, column and row.
-pub(super) fn read_channels(context: usize) -> usize {
+fn read_channels(context: usize) -> usize {
     4 * context + 2
 }
 

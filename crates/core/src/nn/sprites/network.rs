@@ -3,9 +3,8 @@
 use candle_core::{Device, Tensor};
 use rayon::prelude::*;
 
-use super::layers::SPRITES;
-use super::motion::SpriteMotion;
-use super::pictures::{placed, reversed, sigmoid, together, united};
+use super::motion::{SpriteMotion, Ways};
+use super::pictures::{placed, reversed, together, united};
 use super::separation::{Separated, Separation};
 use crate::nn::error::NnError;
 use crate::nn::model_tensors::ModelTensors;
@@ -13,13 +12,14 @@ use crate::nn::ops::activated_convolution::{Activation, activated_convolution};
 use crate::nn::ops::convolution::Convolution3;
 use crate::nn::ops::image_geometry::ConvShape;
 use crate::nn::ops::pixel_shuffle::{pixel_shuffle, pixel_unshuffle};
+use crate::nn::plain::layers::sigmoid;
 use crate::nn::precision::Precision;
 use crate::nn::spec::{ModelSpec, SpriteSpec};
 
 /// What the network gives for N windows. Tensors about sprites have 2 N rows: the first sprites of all windows, then the second ones.
 #[derive(Clone, Debug)]
 pub struct SpritePrediction {
-    /// The predicted frames `[N, steps, P]`.
+    /// The predicted frames `[N, horizon, P]`.
     pub frames: Tensor,
     /// The context's frames as the sprites show them `[N, context, P]`.
     pub context: Tensor,
@@ -27,6 +27,16 @@ pub struct SpritePrediction {
     pub moves: Tensor,
     /// How much each block of the last frame says of a sprite's motion `[2 N, H/4 · W/4]`; each row sums to 1.
     pub trust: Tensor,
+}
+
+/// The sprites of N windows, and how they moved and will move.
+struct Moving {
+    /// `[2 N, H, W]`
+    sprites: Tensor,
+    /// As in [`Separated`].
+    earlier: Tensor,
+    trust: Tensor,
+    ways: Ways,
 }
 
 /// The network: its weights and what they are for.
@@ -59,16 +69,18 @@ impl SpriteNetwork {
         self.motion.pack(precision)
     }
 
-    /// What follows the windows of frames `[N, context, P]`; the frames of the first `steps` only.
-    pub(in crate::nn) fn predict(&self, frames: &Tensor, steps: usize) -> Result<SpritePrediction, NnError> {
-        let windows = frames.dim(0)?;
-        if self.separation.is_trained() || windows == 1 {
-            return self.predict_together(frames, steps);
-        }
-        // One window after another, so that what lies between two layers stays in the processor's cache.
-        let each = (0..windows).into_par_iter();
-        let parts = each.map(|window| self.predict_together(&frames.narrow(0, window, 1)?, steps));
-        SpritePrediction::joined(&parts.collect::<Result<Vec<_>, NnError>>()?)
+    /// All that training learns from, of windows of frames `[N, context, P]`.
+    pub(in crate::nn) fn predict(&self, frames: &Tensor) -> Result<SpritePrediction, NnError> {
+        let moving = self.moving(frames)?;
+        let still = Tensor::zeros((moving.sprites.dim(0)?, 1, 2), moving.earlier.dtype(), &Device::Cpu)?;
+        let so_far = Tensor::cat(&[&reversed(&moving.earlier)?, &still], 1)?;
+        let context = placed(&moving.sprites, &so_far, &so_far.ones_like()?)?;
+        Ok(SpritePrediction {
+            frames: self.coming(&moving, self.spec.horizon)?,
+            context: together(&context, self.spec.image_size())?,
+            moves: moving.ways.moves,
+            trust: moving.trust,
+        })
     }
 
     /// Frames `[N, steps, P]` that follow the windows `windows[n]` of frames `[B, context, P]`. Beyond the horizon, each horizon follows
@@ -85,30 +97,44 @@ impl SpriteNetwork {
             let done = known.dim(1)? - context;
             let last = known.narrow(1, done, context)?;
             let asked = horizon.min(steps - done);
-            known = Tensor::cat(&[&known, &self.predict(&last, asked)?.frames.clamp(0f32, 1f32)?], 1)?;
+            known = Tensor::cat(&[&known, &self.frames(&last, asked)?], 1)?;
         }
         let predicted = known.narrow(1, context, steps)?.contiguous()?;
         Ok(predicted.index_select(&Tensor::new(windows, &Device::Cpu)?, 0)?)
     }
 
-    fn predict_together(&self, frames: &Tensor, steps: usize) -> Result<SpritePrediction, NnError> {
+    /// The first `steps` frames that follow the windows of frames `[N, context, P]`, as pixels of 0 to 1.
+    fn frames(&self, frames: &Tensor, steps: usize) -> Result<Tensor, NnError> {
+        let together = |frames: &Tensor| self.coming(&self.moving(frames)?, steps);
+        let windows = frames.dim(0)?;
+        if self.separation.is_trained() || windows == 1 {
+            return Ok(together(frames)?.clamp(0f32, 1f32)?);
+        }
+        // One window after another, so that what lies between two layers stays in the processor's cache.
+        let each = (0..windows).into_par_iter();
+        let parts = each.map(|window| together(&frames.narrow(0, window, 1)?));
+        Ok(Tensor::cat(&parts.collect::<Result<Vec<_>, NnError>>()?, 0)?.clamp(0f32, 1f32)?)
+    }
+
+    fn moving(&self, frames: &Tensor) -> Result<Moving, NnError> {
         let size = self.spec.image_size();
         let frames = frames.contiguous()?;
         let seen = self.separation.separate(&frames, size)?;
         let sprites = self.whole_sprites(&frames, &seen)?;
-        let ways = self.motion.ways(&sprites, &seen.earlier, size, self.spec.horizon)?;
-        let ahead = |values: &Tensor| values.narrow(1, 0, steps);
-        // The context's frames teach what the sprites look like, the frames to come how they move.
-        let coming = placed(&sprites.detach(), &ahead(&ways.moves)?, &ahead(&ways.widths)?)?;
-        let still = Tensor::zeros((sprites.dim(0)?, 1, 2), seen.earlier.dtype(), &Device::Cpu)?;
-        let so_far = Tensor::cat(&[&reversed(&seen.earlier)?, &still], 1)?;
-        let context = placed(&sprites, &so_far, &so_far.ones_like()?)?;
-        Ok(SpritePrediction {
-            frames: together(&coming, size)?,
-            context: together(&context, size)?,
-            moves: ways.moves,
+        Ok(Moving {
+            ways: self.motion.ways(&sprites, &seen.earlier, size, self.spec.horizon)?,
+            sprites,
+            earlier: seen.earlier,
             trust: seen.trust,
         })
+    }
+
+    /// The first `steps` frames to come. They teach how the sprites move; what these look like, the context's frames teach.
+    fn coming(&self, moving: &Moving, steps: usize) -> Result<Tensor, NnError> {
+        let ahead = |values: &Tensor| values.narrow(1, 0, steps);
+        let Ways { moves, widths } = &moving.ways;
+        let coming = placed(&moving.sprites.detach(), &ahead(moves)?, &ahead(widths)?)?;
+        together(&coming, self.spec.image_size())
     }
 
     /// The sprites `[2 N, H, W]`, with what the other one hides.
@@ -129,25 +155,5 @@ impl SpriteNetwork {
         let hidden = pixel_shuffle(&activated_convolution(output, &inner, Activation::Silu, None)?)?;
         let hidden = sigmoid(&(hidden.reshape(seen.parts.shape())? - 4.0)?)?;
         united(&[seen.parts.clone(), hidden])
-    }
-}
-
-impl SpritePrediction {
-    /// The predictions of single windows, one after another.
-    fn joined(parts: &[Self]) -> Result<Self, NnError> {
-        let joined = |of: fn(&Self) -> &Tensor| Tensor::cat(&parts.iter().map(of).collect::<Vec<_>>(), 0);
-        let of_sprites = |of: fn(&Self) -> &Tensor| -> candle_core::Result<Tensor> {
-            let rows = |sprite: usize| parts.iter().map(move |part| of(part).narrow(0, sprite, 1));
-            Tensor::cat(
-                &(0..SPRITES).flat_map(rows).collect::<candle_core::Result<Vec<_>>>()?,
-                0,
-            )
-        };
-        Ok(Self {
-            frames: joined(|part| &part.frames)?,
-            context: joined(|part| &part.context)?,
-            moves: of_sprites(|part| &part.moves)?,
-            trust: of_sprites(|part| &part.trust)?,
-        })
     }
 }

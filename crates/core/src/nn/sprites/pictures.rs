@@ -51,8 +51,3 @@ pub(super) fn reversed(values: &Tensor) -> candle_core::Result<Tensor> {
     let order = Tensor::from_iter((0..count).rev(), values.device())?;
     values.contiguous()?.index_select(&order, 1)
 }
-
-/// `1 / (1 + e^−x)`, by a function whose gradient never overflows.
-pub(super) fn sigmoid(values: &Tensor) -> candle_core::Result<Tensor> {
-    ((values * 0.5)?.tanh()? + 1.0)? * 0.5
-}

@@ -6,7 +6,7 @@ use super::block_tracks::{REACH, TRACK_VALUES, block_tracks};
 use super::layers::SPRITES;
 use super::two_ways::{FARTHEST_PX, two_ways};
 use crate::nn::error::NnError;
-use crate::nn::ops::sampling::ImageSize;
+use crate::nn::ops::sampling::{ImageSize, centred};
 use crate::nn::tensors::with_values;
 
 /// What is read of N windows.
@@ -68,7 +68,6 @@ fn blocks_and_places<'a>(frames: &(impl Iterator<Item = &'a [f32]> + Clone), siz
             let block = &frame[2 * row * size.width + 2 * column..];
             inputs.extend([block[0], block[1], block[size.width], block[size.width + 1]]);
         }
-        let centred = |at: usize, side: usize| (2.0 * at as f32 + 1.0) / side as f32 - 1.0;
         inputs.extend([centred(column, half.width), centred(row, half.height)]);
     }
     inputs

@@ -3,7 +3,6 @@
 use candle_core::Tensor;
 
 use super::layers::SPRITES;
-use super::pictures::sigmoid;
 use super::reading::Reading;
 use crate::nn::error::NnError;
 use crate::nn::model_tensors::ModelTensors;
@@ -14,6 +13,7 @@ use crate::nn::ops::linear::{Linear, per_place};
 use crate::nn::ops::modulation::silu;
 use crate::nn::ops::pixel_shuffle::pixel_shuffle;
 use crate::nn::ops::sampling::ImageSize;
+use crate::nn::plain::layers::sigmoid;
 use crate::nn::precision::Precision;
 use crate::nn::spec::SpriteSpec;
 
