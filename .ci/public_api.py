@@ -24,20 +24,23 @@ MOST_BARE, MOST_ALL = 60, 155
 FORBIDDEN = "candle"
 
 
-def rustdoc(package):
-    """The JSON of one package's library."""
+def write_documents():
+    """The JSON of all packages, by one run of cargo with the features of the usual build, so that no dependency compiles again."""
     with tempfile.TemporaryDirectory() as scratch:
         # RUSTC_BOOTSTRAP lets the stable rustdoc write JSON. Set for cargo, it would make all dependencies compile anew.
         wrapper = Path(scratch) / "rustdoc"
         wrapper.write_text(f'#!/bin/sh\nRUSTC_BOOTSTRAP=1 exec {os.environ.get("RUSTDOC", "rustdoc")} "$@"\n')
         wrapper.chmod(0o755)
-        command = ["cargo", "rustdoc", "-q", "--release", "--locked", "-p", package, "--lib", "--", "-Z", "unstable-options"]
+        flags = "-Z unstable-options --output-format json --cap-lints allow"
         subprocess.run(
-            [*command, "--output-format", "json", "--cap-lints", "allow"],
+            ["cargo", "doc", "-q", "--release", "--locked", "--no-deps"],
             cwd=ROOT,
-            env={**os.environ, "RUSTDOC": str(wrapper)},
+            env={**os.environ, "RUSTDOC": str(wrapper), "RUSTDOCFLAGS": flags},
             check=True,
         )
+
+
+def document(package):
     target = Path(os.environ.get("CARGO_TARGET_DIR", ROOT / "target"))
     return json.loads((target / "doc" / f"{package.replace('-', '_')}.json").read_text())
 
@@ -173,7 +176,8 @@ class Crate:
 
 
 def interface():
-    crates = {f"foreframe_{name}": Crate(rustdoc(f"foreframe-{name}")) for name in CRATES}
+    write_documents()
+    crates = {f"foreframe_{name}": Crate(document(f"foreframe-{name}")) for name in CRATES}
     exports = re_exports()
     lines, problems, canonical = [], [], set()
     for feature, source, name in sorted(exports, key=lambda entry: entry[2]):
