@@ -568,7 +568,7 @@ class SpriteNetwork:
     """Two pictures, cut out of the context, that move as wholes over black."""
 
     WINDOW, REACH, LEAST_ENERGY, CHANGE_COST, MOST_CHANGE, SPEED_FRAMES = (12, 16), 4, 1.0, 0.02, 8.0, 3
-    FARTHEST, MISFIT_DECAY = 4.0, 10.0
+    FARTHEST, MISFIT_DECAY, MOST_CANDIDATES, LEAST_GAIN, LEAST_PART = 4.0, 10.0, 256, 4e-6, 1e-6
 
     def __init__(self, spec, tensors):
         self.spec, self.tensors = spec, tensors
@@ -618,7 +618,8 @@ class SpriteNetwork:
         """How far each block of 4×4 px is in each other frame, to the right and down, and its misfit there; and whether it was followed."""
         height, width = self.WINDOW
         border = 4 * width
-        frame, others = np.pad(frame, border), [np.pad(other, border) for other in others]
+        # Not in f32, whose rounding would decide between places that cost the same.
+        frame, *others = (np.pad(np.float64(each), border) for each in [frame, *others])
         tracks = np.zeros((self.shape[0] // 4, self.shape[1] // 4, len(others), 3), np.float32)
         followed = np.zeros(tracks.shape[:2], bool)
         steps = range(-self.REACH, self.REACH + 1)
@@ -630,16 +631,18 @@ class SpriteNetwork:
             if not followed[block]:
                 continue
             for index, other in enumerate(others):
-                costs = {}
+                least, best = np.inf, before
                 for step in ((down, right) for down in steps for right in steps):
                     there = (at[0] + step[0], at[1] + step[1])
                     seen = other[max(there[0], 0) : there[0] + height, max(there[1], 0) : there[1] + width]
                     if min(there) >= 0 and seen.shape == window.shape:
                         change = (step[0] - before[0]) ** 2 + (step[1] - before[1]) ** 2
-                        costs[step] = ((seen - window) ** 2).sum() + self.CHANGE_COST * min(change, self.MOST_CHANGE)
-                before = min(costs, key=costs.get)
-                at = (at[0] + before[0], at[1] + before[1])
-                tracks[block][index] = at[1] - left, at[0] - top, min(costs[before] / energy, 1)
+                        cost = ((seen - window) ** 2).sum() + self.CHANGE_COST * min(change, self.MOST_CHANGE)
+                        if cost < least * (1 - self.LEAST_PART) - self.LEAST_GAIN:
+                            least, best = cost, step
+                before = best
+                at = (at[0] + best[0], at[1] + best[1])
+                tracks[block][index] = at[1] - left, at[0] - top, min(least / energy, 1)
         return tracks, followed
 
     def two_ways(self, tracks, followed, light):
@@ -647,14 +650,20 @@ class SpriteNetwork:
         apart = np.full(tracks.shape[:2] + (2,), self.FARTHEST)
         ways, fits = tracks[followed][..., :2], np.exp(-self.MISFIT_DECAY * tracks[followed][..., 2])
         votes = light[followed] * fits.mean(1)
-        # Row by row, the distances of all blocks to the way of one of them.
-        distances = np.minimum(np.linalg.norm(ways[None] - ways[:, None], axis=3), self.FARTHEST)
+        if not followed.any():
+            return apart
+        # Each way once, where it comes first; of many, those whose own blocks have the most votes.
+        _, first, which = np.unique(ways, axis=0, return_index=True, return_inverse=True)
+        own = np.bincount(which.ravel(), votes, len(first))[first.argsort()]
+        first = np.sort(first)
+        first = first[np.sort(np.argsort(-own, kind="stable")[: self.MOST_CANDIDATES])]
+        # Row by row, the distances of all blocks to one of the ways.
+        distances = np.minimum(np.linalg.norm(ways[None] - ways[first][:, None], axis=3), self.FARTHEST)
         distances = (distances * fits).sum(2) / (fits.sum(1) + 1e-3)
         for way in (0, 1):
-            if followed.any():
-                best = distances[(np.exp(-(distances**2)) * votes).sum(1).argmax()]
-                apart[followed, way] = best
-                votes = votes * (1 - np.exp(-(best**2)))
+            best = distances[(np.exp(-(distances**2)) * votes).sum(1).argmax()]
+            apart[followed, way] = best
+            votes = votes * (1 - np.exp(-(best**2)))
         return apart
 
     def whole(self, frames, part, earlier):

@@ -38,7 +38,7 @@ use foreframe_train::training::{self, Sweep, TrainConfig, Training, TrainingEven
 pub(super) struct TrainArgs {
     /// paper (dense network, 1000 windows), static (dense, all windows), moving (dense, with state and actions), static-flow,
     /// moving-flow (flow network; moving-flow takes state and actions), rooms (flow network with depth, for rooms of `collect --rooms
-    /// varied`), recording (flow network, with actions) or moving-mnist (flow network, for the benchmark)
+    /// varied`), recording (flow network, with actions) or moving-mnist (sprite network, for the benchmark)
     #[arg(long, default_value = "paper", conflicts_with = "from")]
     preset: String,
     /// Start from the weights and settings of this model: its directory, name or NAME@VERSION. A few hundred steps are often

@@ -35,6 +35,7 @@ pub use self::error::TrainError;
 use self::journal::Journal;
 pub use self::journal::SAMPLE_FILE;
 pub use self::observer::{Observer, TrainingEvent, TrainingStage};
+pub use self::plan::parameter_count;
 use self::plan::{TrainingPlan, window_frames};
 use self::stage::{StageEnd, StageRunner};
 pub use self::start::check_start;

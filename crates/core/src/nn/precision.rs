@@ -32,7 +32,7 @@ impl Precision {
     pub const ALL: [Self; 3] = [Self::F32, Self::Bf16, Self::Int8];
 
     /// Whether this processor multiplies such numbers. For bf16 and int8 it must have instructions for it: without them, these would be
-    /// slower than single precision. With AVX2 and without AVX-512 VNNI, int8 is for dense networks only: flow networks stay in single
+    /// slower than single precision. With AVX2 and without AVX-512 VNNI, int8 is for dense networks only: the others stay in single
     /// precision.
     #[must_use]
     pub fn is_supported(self) -> bool {

@@ -4,10 +4,11 @@ use serde::{Deserialize, Serialize};
 
 use super::{JobError, TrainSpec, datasets};
 use crate::store::Objects;
+use foreframe_core::error_text;
 use foreframe_core::registry::Manifest;
 use foreframe_data::dataset::DatasetInfo;
-use foreframe_train::training::TrainConfig;
 use foreframe_train::training::config::{ArchitectureConfig, CodecStart};
+use foreframe_train::training::{self, TrainConfig, TrainError};
 
 const MIB: u64 = 1 << 20;
 /// Bytes of an f32.
@@ -71,7 +72,7 @@ impl JobMemory {
                 config.pretrain.start = CodecStart::Random;
             }
             steps += config.pretrain.steps + config.sequence.steps;
-            memory_mib = memory_mib.max(training_mib(&config, &dataset, self.held_mib()));
+            memory_mib = memory_mib.max(training_mib(&config, &dataset, self.held_mib())?);
         }
         Ok(TrainingEstimate {
             steps,
@@ -92,7 +93,7 @@ impl JobMemory {
 
     /// Errors: `Invalid` if a training on such a data set certainly needs more memory than a job can use.
     pub(super) fn check_training(self, config: &TrainConfig, dataset: &DatasetInfo) -> Result<(), JobError> {
-        self.check_needed(training_mib(config, dataset, self.held_mib()))
+        self.check_needed(training_mib(config, dataset, self.held_mib())?)
     }
 
     fn check_needed(self, needed: u64) -> Result<(), JobError> {
@@ -176,23 +177,25 @@ const FLOW_PIXEL_VALUES: u64 = 60;
 const SPRITE_PIXEL_VALUES: u64 = 40;
 
 /// The least memory that a training on a data set needs, in MiB, if it holds at most `held_mib` MiB of frames. It leaves out
-/// what is hard to know, so a training that passes this check can still reach its limit.
-#[must_use]
-fn training_mib(config: &TrainConfig, dataset: &DatasetInfo, held_mib: u64) -> u64 {
+/// what is hard to know, so a training that passes this check can still reach its limit. Errors: `Invalid` if there is no such network.
+fn training_mib(config: &TrainConfig, dataset: &DatasetInfo, held_mib: u64) -> Result<u64, JobError> {
+    let weights = training::parameter_count(config, dataset).map_err(|error| {
+        let field = match error {
+            TrainError::Config(_) => "dataset",
+            _ => "settings",
+        };
+        JobError::invalid(field, error_text::with_causes(&error))
+    })?;
     let count = |value: usize| value as u64;
     let pixels = u64::from(dataset.frame_width_px) * u64::from(dataset.frame_height_px);
     let frames = dataset.frame_count as u64;
-    let (weights, features, frame_values) = match config.model.architecture {
+    let (features, frame_values) = match config.model.architecture {
         ArchitectureConfig::Dense(sizes) => {
             let (features, hidden) = (count(sizes.features), count(sizes.hidden));
-            let codec = 2 * pixels * features;
-            let network = 2 * 4 * hidden * (features + hidden) + hidden * features;
-            let frame_values = PIXEL_VALUES * pixels + 2 * features + HIDDEN_VALUES * hidden;
-            (codec + network, features, frame_values)
+            (features, PIXEL_VALUES * pixels + 2 * features + HIDDEN_VALUES * hidden)
         }
-        // Its weights are few beside its activations.
-        ArchitectureConfig::Flow(_) => (0, 0, FLOW_PIXEL_VALUES * pixels),
-        ArchitectureConfig::Sprites(_) => (0, 0, SPRITE_PIXEL_VALUES * pixels),
+        ArchitectureConfig::Flow(_) => (0, FLOW_PIXEL_VALUES * pixels),
+        ArchitectureConfig::Sprites(_) => (0, SPRITE_PIXEL_VALUES * pixels),
     };
     let weights = VALUE * WEIGHT_COPIES * weights;
     let window = count(config.model.context + config.model.horizon);
@@ -208,7 +211,7 @@ fn training_mib(config: &TrainConfig, dataset: &DatasetInfo, held_mib: u64) -> u
     let held = if decoded <= held_mib * MIB { decoded } else { 0 };
     let channels = count(dataset.action_channels.len() + dataset.state_channels.len());
     let numbers = frames * (FRAME_BYTES + VALUE * channels);
-    (held + numbers + weights + work).div_ceil(MIB)
+    Ok((held + numbers + weights + work).div_ceil(MIB))
 }
 
 #[cfg(test)]
@@ -234,7 +237,7 @@ mod tests {
     #[test]
     fn frames_in_a_file_need_no_memory() {
         let config = TrainConfig::layered("paper", None, &[]).unwrap();
-        let needed = |count| training_mib(&config, &frames(count), 1024);
+        let needed = |count| training_mib(&config, &frames(count), 1024).unwrap();
         let (small, held, large) = (needed(10_000), needed(262_144), needed(300_000));
         assert!((small + 900..small + 1024).contains(&held), "{small} {held}");
         assert!(
@@ -259,9 +262,23 @@ mod tests {
         let huge = "[model]\nhidden = 2048\nfeatures = 2048\n[sequence]\nbatch_size = 4096\n";
         let huge = TrainConfig::layered("paper", Some(huge), &[]).unwrap();
         let (usual, huge) = (
-            training_mib(&usual, &dataset, 1024),
-            training_mib(&huge, &dataset, 1024),
+            training_mib(&usual, &dataset, 1024).unwrap(),
+            training_mib(&huge, &dataset, 1024).unwrap(),
         );
         assert!(usual < 2048 && huge > 4096, "{usual} {huge}");
+    }
+
+    #[test]
+    fn the_weights_of_every_network_count() {
+        let dataset = frames(1000);
+        let of = |toml: &str| {
+            let config = TrainConfig::layered("moving-mnist", Some(toml), &[]).unwrap();
+            training_mib(&config, &dataset, 1024)
+        };
+        // 75 million parameters: 2.7 GB with gradients, moments and copies.
+        let wide = of("[model.sprites]\nchannels = 512\nencoder_blocks = 16\n").unwrap();
+        assert!((2500..3500).contains(&wide), "{wide}");
+        let refused = of("[model.sprites]\nchannels = 0\n").unwrap_err().to_string();
+        assert!(refused.contains("sprites.channels"), "{refused}");
     }
 }

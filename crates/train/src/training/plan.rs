@@ -9,7 +9,7 @@ use foreframe_core::nn::ModelSpec;
 use foreframe_core::nn::spec::MIN_CHANNEL_STD;
 use foreframe_core::registry::{DatasetShare, DatasetStamp, Manifest, ProgramStamp};
 use foreframe_data::dataset::sampler::{Split, Splits, first_seconds};
-use foreframe_data::dataset::{Dataset, DatasetPart, Window};
+use foreframe_data::dataset::{Dataset, DatasetInfo, DatasetPart, Window};
 
 /// What is fixed before the first step: the windows and the model specification.
 pub(super) struct TrainingPlan<'a> {
@@ -163,6 +163,15 @@ impl<'a> TrainingPlan<'a> {
         }
         metrics
     }
+}
+
+/// The number of parameters of the network that a training on a data set makes. Errors: `Config` if it takes actions or states that the
+/// data set does not have; `Network` if one of its sizes is out of range.
+pub fn parameter_count(config: &TrainConfig, dataset: &DatasetInfo) -> Result<u64, TrainError> {
+    let spec = config.unscaled_spec(dataset);
+    check_conditioning(&dataset.name, &spec)?;
+    spec.validate()?;
+    Ok(spec.parameter_count())
 }
 
 /// Errors: `Config` if the model takes actions or states that the data set does not have.

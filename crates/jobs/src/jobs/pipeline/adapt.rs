@@ -84,6 +84,6 @@ impl Pipeline {
             JobError::invalid(field, error_text::with_causes(&error))
         })?;
         self.resources.memory.check_training(&config, &info)?;
-        check_starts(vec![config], Some(base), info).await
+        check_starts(vec![config], Some(&base), info).await
     }
 }

@@ -149,8 +149,8 @@ impl Pipeline {
             return Ok(());
         }
         let (memory, objects) = (self.resources.memory, self.store.objects());
-        memory.check(spec, base.as_ref(), objects).await?;
-        check_starts(configs, base, described(objects, &spec.dataset).await?).await
+        check_starts(configs, base.as_ref(), described(objects, &spec.dataset).await?).await?;
+        memory.check(spec, base.as_ref(), objects).await
     }
 }
 
@@ -179,10 +179,10 @@ fn load_base(dir: &Path, name: &ModelName, version: u32) -> Result<StoredWeights
 /// Errors: `Invalid` if trainings on a data set cannot start from their base, if they have one.
 pub(super) async fn check_starts(
     configs: Vec<TrainConfig>,
-    base: Option<Manifest>,
+    base: Option<&Manifest>,
     info: DatasetInfo,
 ) -> Result<(), JobError> {
-    let Some(base) = base else { return Ok(()) };
+    let Some(base) = base.cloned() else { return Ok(()) };
     // On a blocking thread: it makes tensors as large as the model.
     let checked = tokio::task::spawn_blocking(move || check_each_start(&configs, &info, &base));
     checked.await.unwrap_or(Err(JobError::Stopping))
@@ -213,10 +213,9 @@ pub async fn estimate_training(
     objects: &Objects,
 ) -> Result<TrainingEstimate, JobError> {
     let base = base_manifest(spec, versions).await?;
-    let estimate = memory.estimate(spec, base.as_ref(), objects).await?;
     let info = described(objects, &spec.dataset).await?;
-    check_starts(spec.configs(base.as_ref())?, base, info).await?;
-    Ok(estimate)
+    check_starts(spec.configs(base.as_ref())?, base.as_ref(), info).await?;
+    memory.estimate(spec, base.as_ref(), objects).await
 }
 
 /// The description of the model that a training starts from; `None` for new weights. Errors: `NotFound` and `Invalid`, which name the
