@@ -280,6 +280,16 @@ async fn a_model_that_does_not_fit_is_refused_at_once() {
             "from: the training cannot start from the model \"rooms\": ",
         ),
         (
+            json!({"kind": "train", "name": "further", "dataset": "seen", "preset": "static-flow",
+                "settings": {"model": {"flow": {"channels": 0}}}}),
+            "settings: model specification: flow.channels is 0; it must be 1 to 512",
+        ),
+        (
+            json!({"kind": "train", "name": "further", "dataset": "seen", "preset": "static-flow",
+                "sweep": {"model.context": [5, 1000]}}),
+            "settings: model specification: context is 1000; it must be 1 to ",
+        ),
+        (
             further("static", json!({"from_version": "x"})),
             "from_version: invalid type: string \"x\"",
         ),

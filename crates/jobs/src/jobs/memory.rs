@@ -55,7 +55,6 @@ impl JobMemory {
         base: Option<&Manifest>,
         objects: &Objects,
     ) -> Result<TrainingEstimate, JobError> {
-        spec.check_sweep()?;
         let mut dataset = datasets::describe(objects, &spec.dataset).await?;
         for name in spec.mixture.keys() {
             dataset.frame_count += datasets::describe(objects, name).await?.frame_count;
@@ -229,6 +228,7 @@ mod tests {
         DatasetInfo {
             frame_width_px: 64,
             frame_height_px: 64,
+            frame_period_s: 0.2,
             frame_count: count,
             ..DatasetInfo::default()
         }

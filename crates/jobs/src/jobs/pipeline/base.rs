@@ -213,6 +213,7 @@ pub async fn estimate_training(
     objects: &Objects,
 ) -> Result<TrainingEstimate, JobError> {
     let base = base_manifest(spec, versions).await?;
+    spec.check_sweep()?;
     let info = described(objects, &spec.dataset).await?;
     check_starts(spec.configs(base.as_ref())?, base.as_ref(), info).await?;
     memory.estimate(spec, base.as_ref(), objects).await
