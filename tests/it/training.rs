@@ -92,6 +92,11 @@ fn settings_that_do_not_fit_the_network_or_the_camera_are_refused() {
         ),
         (
             "moving-mnist",
+            "sequence.movers_weight=0.5",
+            "sequence.movers_weight is for the flow network only; it must be 0 where model.architecture is sprites",
+        ),
+        (
+            "moving-mnist",
             "sequence.reconstruction_weight=0",
             "sequence.reconstruction_weight is 0, but the sprite network learns what the sprites look like from the frames that it sees; \
              it must be above 0 where model.architecture is sprites",

@@ -87,40 +87,15 @@ impl TrainConfig {
         let (run, sequence) = (&self.run, &self.sequence);
         let architecture = self.model.architecture.kind();
         let uses_muon = run.optimizer == UpdateRule::Muon && architecture == ArchitectureKind::Dense;
-        let of_flow = |weight: f64| weight > 0.0 && architecture != ArchitectureKind::Flow;
-        let has_motion = architecture != ArchitectureKind::Dense;
+        let counts_few = sequence.short_share > 0.0 && architecture != ArchitectureKind::Flow;
+        let of_flow = [sequence.scene_weight, sequence.movers_weight, sequence.speeds_weight];
+        let [scene, movers, speeds] = of_flow.map(|weight| weight > 0.0 && architecture == ArchitectureKind::Sprites);
         let of_others = [
             ("run.optimizer", uses_muon, "the flow and sprite networks", "adam"),
-            (
-                "sequence.short_share",
-                of_flow(sequence.short_share),
-                "the flow network",
-                "0",
-            ),
-            (
-                "sequence.motion_weight",
-                sequence.motion_weight > 0.0 && !has_motion,
-                "the flow and sprite networks",
-                "0",
-            ),
-            (
-                "sequence.scene_weight",
-                of_flow(sequence.scene_weight),
-                "the flow network",
-                "0",
-            ),
-            (
-                "sequence.movers_weight",
-                of_flow(sequence.movers_weight),
-                "the flow network",
-                "0",
-            ),
-            (
-                "sequence.speeds_weight",
-                of_flow(sequence.speeds_weight),
-                "the flow network",
-                "0",
-            ),
+            ("sequence.short_share", counts_few, "the flow network", "0"),
+            ("sequence.scene_weight", scene, "the flow network", "0"),
+            ("sequence.movers_weight", movers, "the flow network", "0"),
+            ("sequence.speeds_weight", speeds, "the flow network", "0"),
         ];
         if let Some((field, _, networks, needed)) = of_others.iter().find(|(_, is_set, _, _)| *is_set) {
             return refused(format!(
