@@ -15,8 +15,8 @@ const LEAST_ENERGY: f32 = 1.0;
 /// What it costs to move otherwise than in the frame before, for each squared pixel, and the most that it costs.
 const CHANGE_COST: f32 = 0.02;
 const MOST_CHANGE: f32 = 8.0;
-/// By how much a place has to cost less than an earlier one, and by which part: costs that are equal in whole gray levels differ by
-/// less, from rounding alone. Others differ by at least half of a squared gray level, 0.0000077.
+/// A later place must cost less than the best so far by more than the sum of [`LEAST_GAIN`] and the part [`LEAST_PART`] of that cost. Rounding
+/// alone makes smaller differences. Costs of whole gray levels that differ do so by at least half of a squared level, 0.0000077.
 const LEAST_GAIN: f32 = 4e-6;
 const LEAST_PART: f32 = 1e-6;
 /// Black pixels around the frames.

@@ -8,7 +8,7 @@ use super::block_tracks::{TRACK_VALUES, Tracks};
 pub(super) const MISFIT_DECAY: f32 = 10.0;
 /// Distances between ways that are larger, in pixels, count as this.
 pub(super) const FARTHEST_PX: f32 = 4.0;
-/// So many ways are put to the vote, so that its cost does not grow with the square of the pixels.
+/// Ways that can get votes, at most. Without a limit, the cost would grow with the square of the pixels.
 const MOST_CANDIDATES: usize = 256;
 
 /// How far each block went from each of two ways, in pixels, in the mean over the frames: block after block. The first way is the one that
