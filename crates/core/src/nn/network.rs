@@ -108,6 +108,16 @@ impl Network {
         &self.spec
     }
 
+    /// Whether windows cost less together than each alone: a dense layer reads its weights once for all, and a graphics card computes all
+    /// at once.
+    pub(crate) fn gains_from_batches(&self) -> bool {
+        match &self.network {
+            AnyNetwork::Dense(_) => true,
+            AnyNetwork::Flow(flow) => flow.is_plain,
+            AnyNetwork::Sprites(_) => false,
+        }
+    }
+
     /// Codes `[N, code_len]` of frames `[N, P]` in the model's space. Errors: `Shape`.
     pub fn encode_frames(&self, frames: &Tensor) -> Result<Tensor, NnError> {
         self.check("frames", frames, &[None, Some(self.spec.pixels())])?;

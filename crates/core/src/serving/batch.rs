@@ -1,4 +1,4 @@
-//! Chooses the tasks of the next batch: a pure function of the waiting tasks, the time and the limit.
+//! Chooses the tasks of the next batch: a pure function of the waiting tasks, the time and the limits.
 
 use std::time::Instant;
 
@@ -11,6 +11,8 @@ pub struct Candidate {
     pub session: Option<u64>,
     /// Number of rollouts that it asks for, at least 1.
     pub rows: usize,
+    /// How many rollouts of its model are computed together at most.
+    pub row_limit: usize,
     /// Whether its client has disconnected.
     pub abandoned: bool,
     /// After this time nobody needs the answer.
@@ -26,10 +28,10 @@ pub struct BatchChoice {
     pub batch: Vec<usize>,
 }
 
-/// The oldest live task chooses the model. Later tasks of the same model join in order while the rows stay within the
+/// The oldest live task chooses the model. Later tasks of the same model join in order while the rows stay within its
 /// limit, at most one task of a session. The oldest task is always included, even if it alone exceeds the limit.
 #[must_use]
-pub fn choose(waiting: &[Candidate], now: Instant, row_limit: usize) -> BatchChoice {
+pub fn choose(waiting: &[Candidate], now: Instant) -> BatchChoice {
     let mut choice = BatchChoice::default();
     let (mut model, mut rows, mut sessions) = (None, 0, Vec::new());
     for (position, candidate) in waiting.iter().enumerate() {
@@ -37,7 +39,7 @@ pub fn choose(waiting: &[Candidate], now: Instant, row_limit: usize) -> BatchCho
             choice.discard.push(position);
             continue;
         }
-        let fits = choice.batch.is_empty() || rows + candidate.rows <= row_limit;
+        let fits = choice.batch.is_empty() || rows + candidate.rows <= candidate.row_limit;
         let is_later_step = candidate.session.is_some_and(|session| sessions.contains(&session));
         sessions.extend(candidate.session);
         if fits && !is_later_step && *model.get_or_insert(candidate.model) == candidate.model {
@@ -93,13 +95,14 @@ mod tests {
         proptest::collection::vec(kind, 0..40)
     }
 
-    fn candidates(kinds: &[TaskKind], now: Instant) -> Vec<Candidate> {
+    fn candidates(kinds: &[TaskKind], now: Instant, row_limit: usize) -> Vec<Candidate> {
         kinds
             .iter()
             .map(|kind| Candidate {
                 model: kind.model,
                 session: kind.session,
                 rows: kind.rows,
+                row_limit,
                 abandoned: kind.abandoned,
                 deadline: if kind.late { now } else { now + Duration::from_secs(1) },
             })
@@ -108,7 +111,7 @@ mod tests {
 
     fn chosen(kinds: &[TaskKind], limit: usize) -> BatchChoice {
         let now = Instant::now();
-        choose(&candidates(kinds, now), now, limit)
+        choose(&candidates(kinds, now, limit), now)
     }
 
     #[test]
@@ -147,8 +150,8 @@ mod tests {
         #[test]
         fn a_batch_holds_the_oldest_task_and_others_of_its_model(kinds in kinds(), limit in 1usize..10) {
             let now = Instant::now();
-            let waiting = candidates(&kinds, now);
-            let choice = choose(&waiting, now, limit);
+            let waiting = candidates(&kinds, now, limit);
+            let choice = choose(&waiting, now);
             let rows: usize = choice.batch.iter().map(|&i| waiting[i].rows).sum();
             prop_assert!(rows <= limit || choice.batch.len() == 1);
             prop_assert!(choice.batch.is_sorted());
@@ -162,8 +165,8 @@ mod tests {
         #[test]
         fn a_batch_holds_only_the_oldest_step_of_a_session(kinds in kinds(), limit in 1usize..10) {
             let now = Instant::now();
-            let waiting = candidates(&kinds, now);
-            for &position in &choose(&waiting, now, limit).batch {
+            let waiting = candidates(&kinds, now, limit);
+            for &position in &choose(&waiting, now).batch {
                 let earlier = waiting[..position].iter().filter(|c| !c.abandoned && c.deadline > now);
                 let session = waiting[position].session;
                 prop_assert!(session.is_none() || earlier.clone().all(|c| c.session != session));

@@ -134,7 +134,9 @@ impl Queue {
 }
 
 impl QueueState {
-    fn next_batch(&mut self, now: Instant, limit: usize) -> Vec<QueuedTask> {
+    fn next_batch(&mut self, now: Instant, batch_limit: usize) -> Vec<QueuedTask> {
+        // Where a batch saves nothing, one rollout for each core: all would else be answered when the last one is computed.
+        let of_cores = batch_limit.min(rayon::current_num_threads());
         let candidates: Vec<Candidate> = self
             .waiting
             .iter()
@@ -142,11 +144,16 @@ impl QueueState {
                 model: Arc::as_ptr(&waiting.model).addr(),
                 session: waiting.session,
                 rows: waiting.task.conditioning_inputs.len().max(1),
+                row_limit: if waiting.model.network.gains_from_batches() {
+                    batch_limit
+                } else {
+                    of_cores
+                },
                 abandoned: waiting.reply.is_closed(),
                 deadline: waiting.deadline,
             })
             .collect();
-        let choice = batch::choose(&candidates, now, limit);
+        let choice = batch::choose(&candidates, now);
         let mut batch = Vec::with_capacity(choice.batch.len());
         let mut remaining = VecDeque::with_capacity(self.waiting.len());
         for (position, waiting) in self.waiting.drain(..).enumerate() {

@@ -52,7 +52,7 @@ pub(super) enum Surroundings {
 #[derive(Clone, Debug)]
 pub(in crate::nn) struct FlowNetwork {
     /// Whether it computes in plain tensor operations: on another device than the CPU, and in tests.
-    pub(super) is_plain: bool,
+    pub(in crate::nn) is_plain: bool,
     pub(super) spec: ModelSpec,
     pub(super) sizes: FlowSpec,
     pub(super) stem: Convolution3,
