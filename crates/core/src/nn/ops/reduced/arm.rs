@@ -5,7 +5,7 @@
 use std::arch::aarch64::{int32x4_t, vdupq_n_s32, veorq_s32};
 use std::arch::asm;
 
-use super::products::{dequantized, products};
+use super::products::{self, products};
 use super::{ByteRange, Group, LANES, PlaceGroups, ReducedPanel, ReducedProduct, Register};
 use crate::nn::ops::casts::casts;
 
@@ -19,11 +19,12 @@ const SHIFT: i32 = 128;
 casts! {
     group_bits: Register<Group> => [int32x4_t; QUARTERS];
     whole: [int32x4_t; QUARTERS] => Register<i32>;
+    whole_bits: Register<i32> => [int32x4_t; QUARTERS];
 }
 
 products!(
     fn multiply_bytes, "neon,dotprod", places 6 then 3, vectors 1,
-    sums [vdupq_n_s32(0); QUARTERS], weights group_bits, group of_all, add add_products, finish finish
+    weights group_bits, group of_all, start first_sums, add add_products, finish finish
 );
 
 /// The same group for all outputs, as bytes with a sign.
@@ -57,9 +58,16 @@ fn add_products(
     sums
 }
 
-/// What sums of products of shifted bytes stand for.
+/// As [`products::first_sums`].
 #[target_feature(enable = "neon,dotprod")]
 #[inline]
-fn finish(sums: [int32x4_t; QUARTERS], range: Option<ByteRange>, panel: &ReducedPanel, vector: usize) -> Register<f32> {
-    dequantized(whole(sums), SHIFT, range, panel, vector)
+fn first_sums(range: ByteRange, panel: &ReducedPanel, vector: usize) -> [int32x4_t; QUARTERS] {
+    whole_bits(products::first_sums(SHIFT, range, panel, vector))
+}
+
+/// As [`products::dequantized`].
+#[target_feature(enable = "neon,dotprod")]
+#[inline]
+fn finish(sums: [int32x4_t; QUARTERS], range: ByteRange, panel: &ReducedPanel, vector: usize) -> Register<f32> {
+    products::dequantized(whole(sums), range, panel, vector)
 }

@@ -5,10 +5,9 @@
 
 use std::arch::x86_64::{
     __m256i, _mm256_add_epi32, _mm256_madd_epi16, _mm256_maddubs_epi16, _mm256_set1_epi16, _mm256_set1_epi32,
-    _mm256_setzero_si256,
 };
 
-use super::products::{dequantized, products};
+use super::products::{self, products};
 use super::{ByteRange, Group, PlaceGroups, ReducedPanel, ReducedProduct, Register};
 use crate::nn::ops::casts::casts;
 
@@ -18,11 +17,12 @@ pub(super) const MOST_OF_WEIGHT: f32 = 63.0;
 casts! {
     group_bits: Register<Group> => [__m256i; 2];
     whole: [__m256i; 2] => Register<i32>;
+    whole_bits: Register<i32> => [__m256i; 2];
 }
 
 products!(
     fn multiply_bytes, "avx2", places 4 then 2, vectors 1,
-    sums [_mm256_setzero_si256(); 2], weights group_bits, group of_all, add add_products, finish finish
+    weights group_bits, group of_all, start first_sums, add add_products, finish finish
 );
 
 /// The same group for all outputs.
@@ -44,9 +44,16 @@ fn add_products(mut sums: [__m256i; 2], group: __m256i, weights: [__m256i; 2]) -
     sums
 }
 
-/// What sums of products of bytes stand for.
+/// As [`products::first_sums`].
 #[target_feature(enable = "avx2")]
 #[inline]
-fn finish(sums: [__m256i; 2], range: Option<ByteRange>, panel: &ReducedPanel, vector: usize) -> Register<f32> {
-    dequantized(whole(sums), 0, range, panel, vector)
+fn first_sums(range: ByteRange, panel: &ReducedPanel, vector: usize) -> [__m256i; 2] {
+    whole_bits(products::first_sums(0, range, panel, vector))
+}
+
+/// As [`products::dequantized`].
+#[target_feature(enable = "avx2")]
+#[inline]
+fn finish(sums: [__m256i; 2], range: ByteRange, panel: &ReducedPanel, vector: usize) -> Register<f32> {
+    products::dequantized(whole(sums), range, panel, vector)
 }

@@ -3,17 +3,17 @@
 #![allow(clippy::inline_always)]
 
 use std::arch::x86_64::{
-    __m512, __m512bh, __m512i, _mm512_add_ps, _mm512_dpbf16_ps, _mm512_dpbusd_epi32, _mm512_set1_epi32,
-    _mm512_setzero_ps, _mm512_setzero_si512,
+    __m512, __m512bh, __m512i, _mm512_add_ps, _mm512_cvtepi32_ps, _mm512_dpbf16_ps, _mm512_dpbusd_epi32, _mm512_mul_ps,
+    _mm512_mullo_epi32, _mm512_set1_epi32, _mm512_set1_ps, _mm512_setzero_ps,
 };
 
-use super::products::{dequantized, products};
+use super::products::{self, products};
 use super::{ByteRange, Group, PlaceGroups, ReducedPanel, ReducedProduct, Register};
 use crate::nn::ops::casts::casts;
 
 casts! {
     group_bits: Register<Group> => __m512i;
-    whole: __m512i => Register<i32>;
+    whole_bits: Register<i32> => __m512i;
     float_bits: Register<f32> => __m512;
     halves: __m512i => __m512bh;
     floats: __m512 => Register<f32>;
@@ -21,11 +21,11 @@ casts! {
 
 products!(
     fn multiply_halves, "avx512f,avx512bf16", places 8 then 4, vectors 1 2 3,
-    sums _mm512_setzero_ps(), weights group_bits, group of_all, add add_halves, finish finish_halves
+    weights group_bits, group of_all, start no_sum, add add_halves, finish finish_halves
 );
 products!(
     fn multiply_bytes, "avx512f,avx512vnni", places 8 then 4, vectors 1 2 3,
-    sums _mm512_setzero_si512(), weights group_bits, group of_all, add _mm512_dpbusd_epi32, finish finish_bytes
+    weights group_bits, group of_all, start first_sums, add _mm512_dpbusd_epi32, finish finish_bytes
 );
 
 /// The same group for all outputs.
@@ -41,16 +41,32 @@ fn add_halves(sum: __m512, group: __m512i, weights: __m512i) -> __m512 {
     _mm512_dpbf16_ps(sum, halves(group), halves(weights))
 }
 
+#[target_feature(enable = "avx512f")]
+#[inline]
+fn no_sum(_: ByteRange, _: &ReducedPanel, _: usize) -> __m512 {
+    _mm512_setzero_ps()
+}
+
 /// The sums with the bias.
 #[target_feature(enable = "avx512f")]
 #[inline]
-fn finish_halves(sum: __m512, _: Option<ByteRange>, panel: &ReducedPanel, vector: usize) -> Register<f32> {
+fn finish_halves(sum: __m512, _: ByteRange, panel: &ReducedPanel, vector: usize) -> Register<f32> {
     floats(_mm512_add_ps(sum, float_bits(panel.bias[vector])))
 }
 
-/// What sums of products of bytes stand for.
+/// As [`products::first_sums`].
 #[target_feature(enable = "avx512f")]
 #[inline]
-fn finish_bytes(sum: __m512i, range: Option<ByteRange>, panel: &ReducedPanel, vector: usize) -> Register<f32> {
-    dequantized(whole(sum), 0, range, panel, vector)
+fn first_sums(range: ByteRange, panel: &ReducedPanel, vector: usize) -> __m512i {
+    let zero = _mm512_set1_epi32(-i32::from(range.zero));
+    _mm512_mullo_epi32(whole_bits(panel.weight_sums[vector]), zero)
+}
+
+/// As [`products::dequantized`].
+#[target_feature(enable = "avx512f")]
+#[inline]
+fn finish_bytes(sum: __m512i, range: ByteRange, panel: &ReducedPanel, vector: usize) -> Register<f32> {
+    let factors = _mm512_mul_ps(_mm512_set1_ps(range.scale), float_bits(panel.factors[vector]));
+    let values = _mm512_mul_ps(_mm512_cvtepi32_ps(sum), factors);
+    floats(_mm512_add_ps(float_bits(panel.bias[vector]), values))
 }

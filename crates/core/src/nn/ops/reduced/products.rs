@@ -7,11 +7,12 @@ use crate::nn::ops::packed::StartSums;
 
 /// A function that computes a product with instructions of its own. `places 8 then 4, vectors 1 2 3`: the sums of 8 places stay in
 /// registers while the inputs and weights pass by, for as many vectors of outputs as a panel has, which is 1, 2 or 3; what is left is
-/// computed for 4 places at once, then for each alone.
+/// computed for 4 places at once, then for each alone. The sums of a vector begin with what `start` gives, and `finish` turns them into
+/// values.
 macro_rules! products {
     (
         fn $name:ident, $features:literal, places $places:literal then $fewer:literal, vectors $($vectors:literal)*,
-        sums $no_sum:expr, weights $weights:path, group $group:path, add $add:path, finish $finish:path
+        weights $weights:path, group $group:path, start $start:path, add $add:path, finish $finish:path
     ) => {
         #[target_feature(enable = $features)]
         pub(super) fn $name(mut product: ReducedProduct) {
@@ -43,7 +44,13 @@ macro_rules! products {
                     groups, step, runs, ..
                 } = product.inputs;
                 let weights = panel.weights.as_chunks::<VECTORS>().0;
-                let mut sums = [[$no_sum; VECTORS]; PLACES];
+                let ranges = product.inputs.ranges_of::<PLACES>(place);
+                let mut sums = [[$start(ranges[0], panel, 0); VECTORS]; PLACES];
+                for at in 0..PLACES {
+                    for vector in 0..VECTORS {
+                        sums[at][vector] = $start(ranges[at], panel, vector);
+                    }
+                }
                 for run in runs {
                     let weights = &weights[run.first..][..run.length];
                     // A slice of the loop's length needs no check in the loop, which would keep the sums out of the registers.
@@ -60,12 +67,14 @@ macro_rules! products {
                         }
                     }
                 }
-                for (at, sums) in sums.into_iter().enumerate() {
-                    for (vector, sums) in sums.into_iter().enumerate() {
-                        let values = $finish(sums, product.inputs.range(place + at), panel, vector);
-                        product.store(panel, [place + at, vector], values);
+                // Loops of a known length with little in them are unrolled, so that the sums stay in registers.
+                let mut values = [[products::NO_VALUES; VECTORS]; PLACES];
+                for at in 0..PLACES {
+                    for vector in 0..VECTORS {
+                        values[at][vector] = $finish(sums[at][vector], ranges[at], panel, vector);
                     }
                 }
+                product.store(panel, place, &values);
             }
 
             for outputs in &product.weights.panels {
@@ -80,56 +89,86 @@ macro_rules! products {
 
 pub(super) use products;
 
+pub(super) const NO_VALUES: Register<f32> = Register([0.0; LANES]);
+
 impl PlaceGroups<'_> {
-    /// What the bytes of a place stand for.
+    /// What the bytes of some places from one on stand for; of other numbers than bytes, anything.
     #[inline(always)]
-    pub(super) fn range(&self, place: usize) -> Option<ByteRange> {
+    pub(super) fn ranges_of<const PLACES: usize>(&self, first: usize) -> [ByteRange; PLACES] {
         match self.ranges {
-            [all] => Some(*all),
-            ranges => ranges.get(place).copied(),
+            [] => [ByteRange::default(); PLACES],
+            [all] => [*all; PLACES],
+            ranges => *ranges[first..].first_chunk().expect("a place without a range is a bug"),
         }
     }
 }
 
 impl ReducedProduct<'_> {
-    /// Writes the sums of a vector of outputs at a place.
+    /// Writes the values of a panel's outputs at some places, or adds them to what is there.
     #[inline(always)]
-    pub(super) fn store(&mut self, panel: &ReducedPanel, [place, vector]: [usize; 2], Register(sums): Register<f32>) {
-        let outputs = self.weights.outputs;
-        let first = panel.first + vector * LANES;
-        let out = &mut self.out[place * outputs + first..][..LANES.min(outputs - first)];
-        let held = |at: usize, out: &[f32]| if self.start == StartSums::Output { out[at] } else { 0.0 };
-        match out.as_mut_array::<LANES>() {
-            Some(out) => {
-                for at in 0..LANES {
-                    out[at] = sums[at] + held(at, out);
-                }
+    pub(super) fn store<const VECTORS: usize>(
+        &mut self,
+        panel: &ReducedPanel,
+        first: usize,
+        values: &[[Register<f32>; VECTORS]],
+    ) {
+        let (outputs, adds) = (self.weights.outputs, self.start == StartSums::Output);
+        let width = (VECTORS * LANES).min(outputs - panel.first);
+        let places = self.out[first * outputs..].chunks_exact_mut(outputs);
+        for (out, values) in places.zip(values) {
+            let (vectors, rest) = out[panel.first..][..width].as_chunks_mut::<LANES>();
+            for (out, values) in vectors.iter_mut().zip(values) {
+                put(values, out, adds);
             }
-            None => {
-                for at in 0..out.len() {
-                    out[at] = sums[at] + held(at, out);
-                }
+            let values = values.last().filter(|_| !rest.is_empty());
+            let Some(values) = values else { continue };
+            match rest.as_mut_array::<{ LANES / 2 }>() {
+                Some(out) => put(values, out, adds),
+                None => put_some(values, rest, adds),
             }
         }
     }
 }
 
-/// What sums of products of bytes stand for, with the bias. `shift` was taken from each byte of an input before.
+/// Writes the first of these values, or adds them to what is there.
+#[inline(always)]
+fn put<const COUNT: usize>(Register(values): &Register<f32>, out: &mut [f32; COUNT], adds: bool) {
+    for at in 0..COUNT {
+        out[at] = if adds { values[at] + out[at] } else { values[at] };
+    }
+}
+
+/// As [`put`]. In a function of its own, since it is rarely called.
+#[inline(never)]
+fn put_some(Register(values): &Register<f32>, out: &mut [f32], adds: bool) {
+    for (out, value) in out.iter_mut().zip(values) {
+        *out = if adds { value + *out } else { *value };
+    }
+}
+
+/// What sums of products of bytes begin with, so that a byte that stands for zero counts as none. `shift` was taken from each byte of
+/// an input before.
+#[inline(always)]
+pub(super) fn first_sums(shift: i32, range: ByteRange, panel: &ReducedPanel, vector: usize) -> Register<i32> {
+    let zero = shift - i32::from(range.zero);
+    let Register(mut sums) = panel.weight_sums[vector];
+    for sum in &mut sums {
+        *sum = sum.wrapping_mul(zero);
+    }
+    Register(sums)
+}
+
+/// What such sums stand for, with the bias.
 #[inline(always)]
 pub(super) fn dequantized(
     Register(sums): Register<i32>,
-    shift: i32,
-    range: Option<ByteRange>,
+    range: ByteRange,
     panel: &ReducedPanel,
     vector: usize,
 ) -> Register<f32> {
-    let ByteRange { scale, zero } = range.expect("a place without a range is a bug");
-    let zero = i32::from(zero) - shift;
     let Register(mut values) = panel.bias[vector];
     for lane in 0..LANES {
-        let of_zeros = zero.wrapping_mul(panel.weight_sums[vector].0[lane]);
-        let factor = scale * panel.factors[vector].0[lane];
-        values[lane] += sums[lane].wrapping_sub(of_zeros) as f32 * factor;
+        values[lane] += sums[lane] as f32 * (range.scale * panel.factors[vector].0[lane]);
     }
     Register(values)
 }
