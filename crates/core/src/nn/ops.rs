@@ -10,6 +10,7 @@ pub(super) mod compose;
 pub(super) mod convolution;
 pub(super) mod gathering;
 pub(super) mod image_geometry;
+pub(super) mod joining;
 pub(super) mod linear;
 pub(super) mod modulation;
 pub(super) mod packed;

@@ -17,6 +17,7 @@ use crate::nn::conditioning::ConditioningTensors;
 use crate::nn::error::NnError;
 use crate::nn::geometry::camera::Viewer;
 use crate::nn::ops::compose::{Composition, RoomPlaces};
+use crate::nn::ops::joining::joined;
 use crate::nn::ops::linear::per_place;
 use crate::nn::ops::sampling::sample_features;
 
@@ -172,7 +173,7 @@ impl FlowNetwork {
         let seen = SeenPlaces::of(places, size)?;
         let warped = sample_features(&depths.coarse, seen.coarse.clone(), &context_of)?;
         let beside = seen.beside_features(&depths.views, &context_of, size)?;
-        let state = per_place(&self.mix, &Tensor::cat(&[&warped, &beside], 3)?)?;
+        let state = per_place(&self.mix, &joined([&warped, &beside])?)?;
         let state = self.refined(state, &ahead.modulation()?)?;
         Ok(SeenAhead {
             context_of,

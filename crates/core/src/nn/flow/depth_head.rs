@@ -10,6 +10,7 @@ use crate::nn::model_tensors::ModelTensors;
 use crate::nn::ops::activated_convolution::{Activation, activated_convolution};
 use crate::nn::ops::convolution::Convolution3;
 use crate::nn::ops::image_geometry::ConvShape;
+use crate::nn::ops::joining::joined_to_shuffled;
 use crate::nn::ops::linear::{Linear, per_place};
 use crate::nn::ops::modulation::silu;
 use crate::nn::ops::pixel_shuffle::pixel_shuffle;
@@ -55,10 +56,10 @@ impl DepthHead {
 
     /// The depth of each pixel of the last frames `[contexts, P]`, in metres.
     pub(super) fn forward(&self, [coarse, first]: &[Tensor; 2], views: &DepthViews) -> Result<Tensor, NnError> {
-        let enlarged = silu(&pixel_shuffle(&per_place(&self.enlarge, &silu(coarse)?)?)?)?;
+        let enlarged = silu(&per_place(&self.enlarge, &silu(coarse)?)?)?;
         let logarithm = activated_convolution(
             &self.output,
-            &Tensor::cat(&[&enlarged, first], 3)?,
+            &joined_to_shuffled([&enlarged, first])?,
             Activation::None,
             None,
         )?;

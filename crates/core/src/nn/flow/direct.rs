@@ -10,6 +10,7 @@ use super::steps_ahead::{PredictedAhead, StepsAhead};
 use crate::nn::error::NnError;
 use crate::nn::geometry::camera::{CameraPose, Viewer, turning_places};
 use crate::nn::ops::compose::{Composition, RoomPlaces, SCENE_FEATURES};
+use crate::nn::ops::joining::joined;
 use crate::nn::ops::linear::per_place;
 use crate::nn::ops::pixel_shuffle::pixel_unshuffle;
 use crate::nn::ops::sampling::{PixelPlaces, own_places, sample_features};
@@ -59,7 +60,7 @@ impl FlowNetwork {
             None => with_values(&geometry.turned, blocks_at)??,
         };
         let features = scene.narrow(3, 0, SCENE_FEATURES)?;
-        let mixed = Tensor::cat(&[&warped, &pixel_unshuffle(&features)?], 3)?;
+        let mixed = joined([&warped, &pixel_unshuffle(&features)?])?;
         let state = self.refined(per_place(&self.mix, &mixed)?, &ahead.modulation()?)?;
         let head = self.head(&self.fine(&state, [&moved, &scene], None)?)?;
 

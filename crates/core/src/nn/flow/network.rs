@@ -15,9 +15,9 @@ use crate::nn::model_tensors::ModelTensors;
 use crate::nn::ops::activated_convolution::{Activation, activated_convolution};
 use crate::nn::ops::convolution::Convolution3;
 use crate::nn::ops::image_geometry::ConvShape;
+use crate::nn::ops::joining::joined_to_shuffled;
 use crate::nn::ops::linear::{Linear, per_place};
 use crate::nn::ops::modulation::{perceptron, silu};
-use crate::nn::ops::pixel_shuffle::pixel_shuffle;
 use crate::nn::precision::Precision;
 use crate::nn::spec::{FlowSpec, ModelSpec};
 
@@ -186,8 +186,8 @@ impl FlowNetwork {
         [moved, beside]: [&Tensor; 2],
         added: Option<&Tensor>,
     ) -> Result<Tensor, NnError> {
-        let enlarged = pixel_shuffle(&per_place(&self.enlarge, &silu(state)?)?)?;
-        let inputs = Tensor::cat(&[&enlarged, moved, beside], 3)?;
+        let enlarged = per_place(&self.enlarge, &silu(state)?)?;
+        let inputs = joined_to_shuffled([&enlarged, moved, beside])?;
         Ok(activated_convolution(&self.fine, &inputs, Activation::None, added)?)
     }
 

@@ -11,6 +11,7 @@ use super::scene::Scene;
 use crate::nn::error::NnError;
 use crate::nn::geometry::camera::CameraPose;
 use crate::nn::ops::compose::{Composition, RoomPlaces, SCENE_FEATURES};
+use crate::nn::ops::joining::joined;
 use crate::nn::ops::linear::per_place;
 use crate::nn::ops::pixel_shuffle::pixel_unshuffle;
 use crate::nn::ops::sampling::{PixelPlaces, own_places, sample_features};
@@ -54,7 +55,7 @@ impl FlowNetwork {
             let items = own.chunks_exact(2 * size.pixels()).map(PixelPlaces::Pairs);
             let moved = sampled_blocks(&last_frames, &each, items, size)?;
             let seen = pixel_unshuffle(&moved.narrow(3, 0, BLOCK_PIXELS)?)?;
-            let inputs = Tensor::cat(&[&state, &features, &seen], 3)?;
+            let inputs = joined([&state, &features, &seen])?;
             state = (state + per_place(&self.mix, &inputs)?)?;
             state = self.refined(state, &modulation.narrow(1, step, 1)?.squeeze(1)?)?;
             let head = self.head(&self.fine(&state, [&moved, &scene], None)?)?;
