@@ -117,14 +117,6 @@ fn main() {
     );
     names.retain(|name| asked.is_empty() || asked.iter().any(|asked| asked == name));
     let mut benches: Vec<Bench> = names.iter().map(|name| Bench::new(name)).collect();
-    if let Ok(steps) = std::env::var("STEPS") {
-        for (name, bench) in names.iter().zip(&mut benches) {
-            let mut times: Vec<Duration> = (0..steps.parse::<usize>().unwrap()).map(|_| timed(1, || bench.step())).collect();
-            times.sort();
-            println!("{name}: least {:.3}, median {:.3} ms", times[0].as_secs_f64() * 1e3, times[times.len() / 2].as_secs_f64() * 1e3);
-        }
-        return;
-    }
     let mut least = vec![[Duration::MAX; 5]; names.len()];
     for _ in 0..rounds {
         for (bench, least) in benches.iter_mut().zip(&mut least) {

@@ -39,7 +39,7 @@ impl Precision {
         match self {
             Self::F32 => true,
             #[cfg(target_arch = "x86_64")]
-            Self::Bf16 => is_x86_feature_detected!("avx512f") && is_x86_feature_detected!("avx512bf16"),
+            Self::Bf16 => has_avx512() && is_x86_feature_detected!("avx512bf16"),
             #[cfg(target_arch = "x86_64")]
             Self::Int8 => is_x86_feature_detected!("avx2"),
             #[cfg(target_arch = "aarch64")]
@@ -138,11 +138,17 @@ impl From<Precision> for String {
 /// Whether one instruction of this processor adds up four products of bytes: AVX-512 VNNI, or ARM's dot products. AVX-VNNI is not used.
 pub(super) fn multiplies_four_bytes() -> bool {
     #[cfg(target_arch = "x86_64")]
-    return is_x86_feature_detected!("avx512f") && is_x86_feature_detected!("avx512vnni");
+    return has_avx512() && is_x86_feature_detected!("avx512vnni");
     #[cfg(target_arch = "aarch64")]
     return std::arch::is_aarch64_feature_detected!("dotprod");
     #[cfg(not(any(target_arch = "x86_64", target_arch = "aarch64")))]
     false
+}
+
+/// Whether the processor has AVX-512, also for shorter vectors.
+#[cfg(target_arch = "x86_64")]
+fn has_avx512() -> bool {
+    is_x86_feature_detected!("avx512f") && is_x86_feature_detected!("avx512vl")
 }
 
 /// Makes all models that are loaded from now on predict with it. Errors: `Precision` if this processor cannot, or another precision was

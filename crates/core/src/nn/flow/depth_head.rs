@@ -1,13 +1,17 @@
 //! The layers that estimate depth, and what the decoder reads beside what was moved by it.
+// A closure's vector instructions reach what is inlined into it, and only that.
+#![allow(clippy::inline_always)]
 
-use candle_core::{Device, Tensor};
+use candle_core::{Device, Shape, Tensor};
 
 use super::blocks::{coarse_places, sampled_blocks};
 use super::depth_views::{DepthViews, KNOWN_VALUES};
 use super::reprojection::PLACE_VALUES;
 use crate::nn::error::NnError;
+use crate::nn::fused::{FusedOperation, Operand, apply};
 use crate::nn::model_tensors::ModelTensors;
 use crate::nn::ops::activated_convolution::{Activation, activated_convolution};
+use crate::nn::ops::activation::{exp_with, tanh};
 use crate::nn::ops::convolution::Convolution3;
 use crate::nn::ops::image_geometry::ConvShape;
 use crate::nn::ops::joining::joined_to_shuffled;
@@ -17,6 +21,7 @@ use crate::nn::ops::pixel_shuffle::pixel_shuffle;
 use crate::nn::ops::sampling::{ImageSize, PixelPlaces, own_places};
 use crate::nn::precision::Precision;
 use crate::nn::tensors::with_values;
+use crate::vectorized::{vectorized, vectorized_by};
 
 /// Values beside the moved features from which a step's state is made: place and inverse depth, and whether the last frame
 /// showed it.
@@ -64,9 +69,47 @@ impl DepthHead {
             None,
         )?;
         let logarithm = pixel_shuffle(&logarithm)?.flatten_from(1)?;
-        let factor = (logarithm.tanh()? * MAX_LOGARITHM)?.exp()?;
-        let before = Tensor::from_slice(&views.depths, factor.dims(), &Device::Cpu)?;
-        Ok((factor * before)?)
+        let before = Tensor::from_slice(&views.depths, logarithm.dims(), &Device::Cpu)?;
+        Ok(apply(Deepened, [&logarithm, &before])?)
+    }
+}
+
+/// Depths `[N, P]` before anything is learned, times e^(`MAX_LOGARITHM` · tanh of what is learned). Gradients go to the latter.
+struct Deepened;
+
+impl FusedOperation<2> for Deepened {
+    const NAME: &'static str = "deepen";
+
+    fn forward(&self, [learned, before]: [Operand; 2]) -> candle_core::Result<(Vec<f32>, Shape)> {
+        let mut depths = before.values.to_vec();
+        vectorized_by(
+            #[inline(always)]
+            |instructions| {
+                for (depth, learned) in depths.iter_mut().zip(learned.values) {
+                    *depth *= exp_with(MAX_LOGARITHM as f32 * tanh(*learned), instructions);
+                }
+            },
+        );
+        Ok((depths, learned.layout.shape().clone()))
+    }
+
+    fn backward(
+        &self,
+        [learned, _]: [Operand; 2],
+        depths: Operand,
+        gradient: Operand,
+    ) -> candle_core::Result<[Option<Vec<f32>>; 2]> {
+        let mut for_learned = gradient.values.to_vec();
+        vectorized(
+            #[inline(always)]
+            || {
+                for ((gradient, depth), learned) in for_learned.iter_mut().zip(depths.values).zip(learned.values) {
+                    let share = tanh(*learned);
+                    *gradient *= depth * MAX_LOGARITHM as f32 * (1.0 - share * share);
+                }
+            },
+        );
+        Ok([Some(for_learned), None])
     }
 }
 
@@ -167,4 +210,22 @@ impl SeenPlaces {
 fn room_of(places: &[f32], size: ImageSize) -> PixelPlaces<'_> {
     let pixels = size.pixels();
     PixelPlaces::Axes([2, 3].map(|value| &places[value * pixels..(value + 1) * pixels]))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::nn::gradient_check::{assert_gradients, noise, values};
+
+    #[test]
+    fn depths_are_multiplied_by_what_is_learned() {
+        let (learned, before) = (noise(&[2, 30], 1), (noise(&[2, 30], 2) + 2.0).unwrap());
+        let deepened = |learned: &Tensor| apply(Deepened, [learned, &before]);
+        let expected = (((learned.tanh().unwrap() * MAX_LOGARITHM).unwrap().exp().unwrap()) * &before).unwrap();
+        let pairs = values(&deepened(&learned).unwrap()).into_iter().zip(values(&expected));
+        pairs
+            .into_iter()
+            .for_each(|(found, expected)| assert!((found / expected - 1.0).abs() < 2e-6, "{found} {expected}"));
+        assert_gradients(&[learned], 1e-2, |inputs| deepened(&inputs[0]));
+    }
 }

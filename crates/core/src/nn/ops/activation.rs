@@ -3,6 +3,8 @@
 // `pulp` compiles a closure with vector instructions; that includes only functions that are inlined into it.
 #![allow(clippy::inline_always)]
 
+use crate::vectorized::Instructions;
+
 /// tanh(x) = 2σ(2x) − 1.
 #[inline(always)]
 pub(in crate::nn) fn tanh(x: f32) -> f32 {
@@ -15,22 +17,44 @@ pub(in crate::nn) fn sigmoid(x: f32) -> f32 {
     1.0 / (1.0 + exp(-x))
 }
 
-/// e^x by 2^n · e^r, |r| ≤ ln 2 / 2, the polynomial of Cephes' `expf`. Arguments are clamped to ±87; NaN stays NaN.
+/// σ(x), with the instructions of the loop that it is in.
+#[inline(always)]
+pub(in crate::nn) fn sigmoid_with(x: f32, instructions: Instructions) -> f32 {
+    1.0 / (1.0 + exp_with(-x, instructions))
+}
+
+/// e^x.
 #[inline(always)]
 pub(in crate::nn) fn exp(x: f32) -> f32 {
+    exp_by(x, |a, b, c| a * b + c)
+}
+
+/// e^x, with the instructions of the loop that it is in.
+#[inline(always)]
+pub(in crate::nn) fn exp_with(x: f32, instructions: Instructions) -> f32 {
+    exp_by(
+        x,
+        #[inline(always)]
+        |a, b, c| instructions.multiply_add(a, b, c),
+    )
+}
+
+/// e^x by 2^n · e^r, |r| ≤ ln 2 / 2, the polynomial of Cephes' `expf`, from a · b + c. Arguments are clamped to ±87; NaN stays NaN.
+#[inline(always)]
+fn exp_by(x: f32, add: impl Fn(f32, f32, f32) -> f32) -> f32 {
     /// 1.5 · 2^23: after adding it, the low bits hold the nearest whole number.
     const ROUND: f32 = 12_582_912.0;
     let x = x.clamp(-87.0, 87.0);
-    let shifted = x * std::f32::consts::LOG2_E + ROUND;
+    let shifted = add(x, std::f32::consts::LOG2_E, ROUND);
     let n = shifted - ROUND;
-    let r = (x - n * 0.693_359_4) - n * -2.121_944_4e-4;
+    let r = add(n, 2.121_944_4e-4, add(n, -0.693_359_4, x));
     let mut p = 1.987_569_1e-4;
-    p = p * r + 1.398_2e-3;
-    p = p * r + 8.333_452e-3;
-    p = p * r + 4.166_579_6e-2;
-    p = p * r + 1.666_666_5e-1;
-    p = p * r + 0.5;
-    let mantissa = p * r * r + r + 1.0;
+    p = add(p, r, 1.398_2e-3);
+    p = add(p, r, 8.333_452e-3);
+    p = add(p, r, 4.166_579_6e-2);
+    p = add(p, r, 1.666_666_5e-1);
+    p = add(p, r, 0.5);
+    let mantissa = add(p * r, r, r) + 1.0;
     let power = f32::from_bits((shifted.to_bits() << 23).wrapping_add(0x3F80_0000));
     mantissa * power
 }
@@ -38,6 +62,7 @@ pub(in crate::nn) fn exp(x: f32) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::vectorized::vectorized_by;
 
     #[test]
     fn both_functions_differ_from_exact_values_by_under_3e_7() {
@@ -46,7 +71,10 @@ mod tests {
             let exact = f64::from(x);
             let logistic = 1.0 / (1.0 + (-exact).exp());
             assert!((f64::from(tanh(x)) - exact.tanh()).abs() < 3e-7, "tanh({x})");
-            assert!((f64::from(sigmoid(x)) - logistic).abs() < 3e-7, "sigmoid({x})");
+            let sigmoids = [sigmoid(x), vectorized_by(|instructions| sigmoid_with(x, instructions))];
+            for sigmoid in sigmoids {
+                assert!((f64::from(sigmoid) - logistic).abs() < 3e-7, "sigmoid({x})");
+            }
         }
     }
 

@@ -13,7 +13,7 @@ use super::packed::{PackedWeights, PlaceInputs, StartSums, TapRun};
 use super::scratch::with_buffers;
 use super::winograd::{PatchWeights, TileSize, TiledConvolution};
 use crate::nn::precision::Precision;
-use crate::vectorized::vectorized;
+use crate::vectorized::{Instructions, vectorized_by};
 
 /// Least multiply–adds of a strip. A smaller one takes hardly longer than it takes to wake a thread.
 const LEAST_OF_STRIP: usize = 1 << 19;
@@ -83,19 +83,19 @@ pub(super) enum Written<'a> {
 impl Written<'_> {
     /// Writes neighbouring places `[places, channels]`.
     #[inline(always)]
-    fn write(self, from: &[f32], to: &mut [f32], channels: usize) {
+    fn write(self, from: &[f32], to: &mut [f32], channels: usize, instructions: Instructions) {
         match self {
             Written::Plain => to.copy_from_slice(from),
             Written::Silu => {
                 for (to, &from) in to.iter_mut().zip(from) {
-                    *to = activate(from);
+                    *to = activate(from, instructions);
                 }
             }
             Written::Modulated(modulation) => {
                 let (scale, shift) = modulation.split_at(channels);
                 for (to, from) in to.chunks_exact_mut(channels).zip(from.chunks_exact(channels)) {
                     for (((to, from), scale), shift) in to.iter_mut().zip(from).zip(scale).zip(shift) {
-                        *to = activate(from * (1.0 + scale) + shift);
+                        *to = activate(instructions.multiply_add(*from, 1.0 + scale, *shift), instructions);
                     }
                 }
             }
@@ -165,9 +165,9 @@ impl<'a> BorderedConvolution<'a> {
                 return bytes.forward(x, out, start);
             }
             return with_buffers([x.len(), 0, 0], |[activated, ..]| {
-                vectorized(
+                vectorized_by(
                     #[inline(always)]
-                    || written.write(x, activated, self.strip.channels),
+                    |instructions| written.write(x, activated, self.strip.channels, instructions),
                 );
                 bytes.forward(activated, out, start);
             });
@@ -235,9 +235,9 @@ impl<'a> BorderedConvolution<'a> {
     fn write(&self, bordered: &mut [f32], x: &[f32], first: usize, written: Written) {
         let (channels, dilation) = (self.strip.channels, self.strip.shape.dilation);
         let (length, pitch) = (self.strip.width * channels, self.strip.pitch() * channels);
-        vectorized(
+        vectorized_by(
             #[inline(always)]
-            || {
+            |instructions| {
                 for (row, to) in bordered.chunks_exact_mut(pitch).enumerate() {
                     let from = (first + row).checked_sub(dilation);
                     let Some(from) = from.and_then(|row| x.get(row * length..(row + 1) * length)) else {
@@ -248,7 +248,7 @@ impl<'a> BorderedConvolution<'a> {
                     let (to, right) = to.split_at_mut(length);
                     left.fill(0.0);
                     right.fill(0.0);
-                    written.write(from, to, channels);
+                    written.write(from, to, channels, instructions);
                 }
             },
         );

@@ -5,7 +5,7 @@
 
 use candle_core::{Result, Shape, Tensor, bail};
 
-use super::activation::exp;
+use super::activation::{exp, exp_with};
 use super::gathering::{SAMPLED_TOGETHER, of_pairs, write_together};
 use super::sampling::{ImageSize, Neighbourhood, PixelPlaces, SampledImage};
 use crate::nn::fused::{FusedOperation, Operand, apply};
@@ -126,7 +126,7 @@ impl Composition {
     }
 
     /// Writes some neighbouring pixels of a row (counted over all items) from a column on. The same arithmetic as
-    /// [`Composition::parts`] and [`PixelParts::mixed`].
+    /// [`Composition::parts`] and [`PixelParts::mixed`], but for rounding.
     #[inline(always)]
     fn mix(
         &self,
@@ -172,7 +172,11 @@ impl Composition {
                 head[6][at],
             ];
             let most = logits[0].max(logits[1]).max(logits[2]);
-            let shares = [exp(logits[0] - most), exp(logits[1] - most), exp(logits[2] - most)];
+            let shares = [
+                exp_with(logits[0] - most, instructions),
+                exp_with(logits[1] - most, instructions),
+                exp_with(logits[2] - most, instructions),
+            ];
             let sum = shares[0] + shares[1] + shares[2];
             let content = content[at] + head[7][at];
             mixed[at] = first[at] * (shares[0] / sum) + second[at] * (shares[1] / sum) + content * (shares[2] / sum);

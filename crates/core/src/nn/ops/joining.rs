@@ -58,10 +58,7 @@ impl Joining {
             if *sides.get_or_insert(own) != own {
                 bail!("an image of {own:?} is not joined to one of {sides:?}");
             }
-            *source = Source {
-                channels,
-                is_shuffled,
-            };
+            *source = Source { channels, is_shuffled };
         }
         Ok((sources, sides.unwrap_or_default()))
     }

@@ -5,12 +5,12 @@
 use candle_core::{Result, Shape, Tensor, bail};
 use candle_nn::Module as _;
 
-use super::activation::sigmoid;
+use super::activation::sigmoid_with;
 use super::linear::Linear;
 use super::row_weights::RowWeights;
 use crate::nn::fused::{FusedOperation, Operand, apply};
 use crate::nn::tensors::with_values;
-use crate::vectorized::vectorized;
+use crate::vectorized::{Instructions, vectorized_by};
 
 /// x · σ(x) of each value ("`SiLU`").
 pub(in crate::nn) fn silu(x: &Tensor) -> Result<Tensor> {
@@ -73,11 +73,11 @@ fn packed_perceptron(layers: &[&RowWeights], x: &[f32], rows: usize) -> Vec<f32>
 
 /// `SiLU` of each value, in place.
 pub(super) fn activate_all(values: &mut [f32]) {
-    vectorized(
+    vectorized_by(
         #[inline(always)]
-        || {
+        |instructions| {
             for value in values {
-                *value = activate(*value);
+                *value = activate(*value, instructions);
             }
         },
     );
@@ -90,13 +90,13 @@ pub(in crate::nn) fn modulated_silu(x: &Tensor, modulation: &Tensor) -> Result<T
 }
 
 #[inline(always)]
-pub(super) fn activate(x: f32) -> f32 {
-    x * sigmoid(x)
+pub(super) fn activate(x: f32, instructions: Instructions) -> f32 {
+    x * sigmoid_with(x, instructions)
 }
 
 #[inline(always)]
-fn slope(x: f32) -> f32 {
-    let share = sigmoid(x);
+fn slope(x: f32, instructions: Instructions) -> f32 {
+    let share = sigmoid_with(x, instructions);
     share * (1.0 + x * (1.0 - share))
 }
 
@@ -108,11 +108,11 @@ impl FusedOperation<1> for Silu {
     fn forward(&self, [x]: [Operand; 1]) -> Result<(Vec<f32>, Shape)> {
         let mut values = vec![0.0; x.values.len()];
         // Not `collect`: it is not inlined, so its loop would do without vector instructions.
-        vectorized(
+        vectorized_by(
             #[inline(always)]
-            || {
+            |instructions| {
                 for (value, &x) in values.iter_mut().zip(x.values) {
-                    *value = activate(x);
+                    *value = activate(x, instructions);
                 }
             },
         );
@@ -121,11 +121,11 @@ impl FusedOperation<1> for Silu {
 
     fn backward(&self, [x]: [Operand; 1], _output: Operand, gradient: Operand) -> Result<[Option<Vec<f32>>; 1]> {
         let mut values = vec![0.0; x.values.len()];
-        vectorized(
+        vectorized_by(
             #[inline(always)]
-            || {
+            |instructions| {
                 for ((value, &x), gradient) in values.iter_mut().zip(x.values).zip(gradient.values) {
-                    *value = gradient * slope(x);
+                    *value = gradient * slope(x, instructions);
                 }
             },
         );
@@ -144,14 +144,14 @@ impl FusedOperation<2> for ModulatedSilu {
         let items = out
             .chunks_exact_mut(item)
             .zip(modulation.values.chunks_exact(2 * channels));
-        vectorized(
+        vectorized_by(
             #[inline(always)]
-            || {
+            |instructions| {
                 for (values, modulation) in items {
                     let (scale, shift) = modulation.split_at(channels);
                     for row in values.chunks_exact_mut(channels) {
                         for ((value, scale), shift) in row.iter_mut().zip(scale).zip(shift) {
-                            *value = activate(*value * (1.0 + scale) + shift);
+                            *value = activate(*value * (1.0 + scale) + shift, instructions);
                         }
                     }
                 }
@@ -174,11 +174,11 @@ impl FusedOperation<2> for ModulatedSilu {
             .zip(x.values.chunks_exact(item))
             .zip(modulation.values.chunks_exact(2 * channels))
             .zip(for_modulation.chunks_exact_mut(2 * channels));
-        vectorized(
+        vectorized_by(
             #[inline(always)]
-            || {
+            |instructions| {
                 for (((gradient, x), modulation), sums) in items {
-                    item_gradient(gradient, x, modulation, sums);
+                    item_gradient([x, modulation], gradient, sums, instructions);
                 }
             },
         );
@@ -188,14 +188,14 @@ impl FusedOperation<2> for ModulatedSilu {
 
 /// Turns the output's gradient of one item into the input's, and adds up that of its modulation.
 #[inline(always)]
-fn item_gradient(gradient: &mut [f32], x: &[f32], modulation: &[f32], sums: &mut [f32]) {
+fn item_gradient([x, modulation]: [&[f32]; 2], gradient: &mut [f32], sums: &mut [f32], instructions: Instructions) {
     let channels = modulation.len() / 2;
     let (scale, shift) = modulation.split_at(channels);
     let (scale_sums, shift_sums) = sums.split_at_mut(channels);
     for (gradient, x) in gradient.chunks_exact_mut(channels).zip(x.chunks_exact(channels)) {
         for channel in 0..channels {
             let gain = 1.0 + scale[channel];
-            let inner = gradient[channel] * slope(x[channel] * gain + shift[channel]);
+            let inner = gradient[channel] * slope(x[channel] * gain + shift[channel], instructions);
             scale_sums[channel] += inner * x[channel];
             shift_sums[channel] += inner;
             gradient[channel] = inner * gain;

@@ -53,6 +53,8 @@ struct ReducedPanel {
     first: usize,
     /// Vectors of a group's weights.
     vectors: usize,
+    /// Whether the second half of the last one has no outputs.
+    ends_with_half: bool,
     /// `[groups, vectors]`.
     weights: Vec<Register<Group>>,
     /// `[vectors]` each: of whole numbers, the factors and the sums of the weights.
@@ -212,6 +214,7 @@ impl ReducedWeights {
         ReducedPanel {
             first: from * LANES,
             vectors: to - from,
+            ends_with_half: outputs + LANES / 2 <= to * LANES,
             weights: packed,
             factors,
             weight_sums,

@@ -24,7 +24,7 @@ casts! {
 
 products!(
     fn multiply_bytes, "neon,dotprod", places 6 then 3, vectors 1,
-    weights group_bits, group of_all, start first_sums, add add_products, finish finish
+    weights group_bits, group of_all, start first_sums, add add_products, add_half add_products, finish finish
 );
 
 /// The same group for all outputs, as bytes with a sign.

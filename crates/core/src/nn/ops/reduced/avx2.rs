@@ -22,7 +22,7 @@ casts! {
 
 products!(
     fn multiply_bytes, "avx2", places 4 then 2, vectors 1,
-    weights group_bits, group of_all, start first_sums, add add_products, finish finish
+    weights group_bits, group of_all, start first_sums, add add_products, add_half add_products, finish finish
 );
 
 /// The same group for all outputs.

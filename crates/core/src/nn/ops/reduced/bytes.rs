@@ -62,25 +62,36 @@ impl ByteRange {
 
 /// The least and the largest of the values and of 0.
 fn extremes(values: &[f32]) -> (f32, f32) {
-    /// Values that are compared at once: some vectors, so that none waits for the one before.
-    const TOGETHER: usize = 2 * LANES;
     vectorized(
         #[inline(always)]
         || {
-            let (vectors, rest) = values.as_chunks::<TOGETHER>();
-            let mut least = [0.0; TOGETHER];
+            let (vectors, rest) = values.as_chunks::<LANES>();
+            let (pairs, last) = vectors.as_chunks::<2>();
+            // Two vectors, so that none waits for the one before.
+            let mut least = [[0.0; LANES]; 2];
             let mut most = least;
-            for vector in vectors {
-                for at in 0..TOGETHER {
-                    // On x86-64, one instruction each: `min` and `max` take more, for NaN.
-                    least[at] = if vector[at] < least[at] { vector[at] } else { least[at] };
-                    most[at] = if vector[at] > most[at] { vector[at] } else { most[at] };
+            for pair in pairs {
+                for nth in 0..2 {
+                    widen(&mut least[nth], &mut most[nth], &pair[nth]);
                 }
             }
+            for vector in last {
+                widen(&mut least[0], &mut most[0], vector);
+            }
             let widened = |(least, most): (f32, f32), &value: &f32| (least.min(value), most.max(value));
-            rest.iter().chain(&least).chain(&most).fold((0.0, 0.0), widened)
+            let all = rest.iter().chain(least.as_flattened()).chain(most.as_flattened());
+            all.fold((0.0, 0.0), widened)
         },
     )
+}
+
+#[inline(always)]
+fn widen(least: &mut [f32; LANES], most: &mut [f32; LANES], vector: &[f32; LANES]) {
+    for at in 0..LANES {
+        // On x86-64, one instruction each: `min` and `max` take more, for NaN.
+        least[at] = if vector[at] < least[at] { vector[at] } else { least[at] };
+        most[at] = if vector[at] > most[at] { vector[at] } else { most[at] };
+    }
 }
 
 #[cfg(test)]

@@ -8,34 +8,34 @@ use crate::nn::ops::packed::StartSums;
 /// A function that computes a product with instructions of its own. `places 8 then 4, vectors 1 2 3`: the sums of 8 places stay in
 /// registers while the inputs and weights pass by, for as many vectors of outputs as a panel has, which is 1, 2 or 3; what is left is
 /// computed for 4 places at once, then for each alone. The sums of a vector begin with what `start` gives, and `finish` turns them into
-/// values.
+/// values. Where half of a panel's last vector has no outputs, `add_half` is taken, which may leave it out.
 macro_rules! products {
     (
         fn $name:ident, $features:literal, places $places:literal then $fewer:literal, vectors $($vectors:literal)*,
-        weights $weights:path, group $group:path, start $start:path, add $add:path, finish $finish:path
+        weights $weights:path, group $group:path, start $start:path, add $add:path, add_half $add_half:path, finish $finish:path
     ) => {
         #[target_feature(enable = $features)]
         pub(super) fn $name(mut product: ReducedProduct) {
             #[target_feature(enable = $features)]
-            fn panel<const VECTORS: usize>(product: &mut ReducedProduct, panel: &ReducedPanel) {
+            fn panel<const VECTORS: usize, const HALF: bool>(product: &mut ReducedProduct, panel: &ReducedPanel) {
                 let (mut place, places) = (0, product.out.len() / product.weights.outputs);
                 while place + $places <= places {
-                    block::<$places, VECTORS>(product, panel, place);
+                    block::<$places, VECTORS, HALF>(product, panel, place);
                     place += $places;
                 }
                 while place + $fewer <= places {
-                    block::<$fewer, VECTORS>(product, panel, place);
+                    block::<$fewer, VECTORS, HALF>(product, panel, place);
                     place += $fewer;
                 }
                 while place < places {
-                    block::<1, VECTORS>(product, panel, place);
+                    block::<1, VECTORS, HALF>(product, panel, place);
                     place += 1;
                 }
             }
 
             #[target_feature(enable = $features)]
             #[inline]
-            fn block<const PLACES: usize, const VECTORS: usize>(
+            fn block<const PLACES: usize, const VECTORS: usize, const HALF: bool>(
                 product: &mut ReducedProduct,
                 panel: &ReducedPanel,
                 place: usize,
@@ -62,7 +62,12 @@ macro_rules! products {
                         for at in 0..PLACES {
                             let group = $group(inputs[at][input]);
                             for vector in 0..VECTORS {
-                                sums[at][vector] = $add(sums[at][vector], group, $weights(weights[vector]));
+                                let (sum, weights) = (sums[at][vector], $weights(weights[vector]));
+                                sums[at][vector] = if HALF && vector + 1 == VECTORS {
+                                    $add_half(sum, group, weights)
+                                } else {
+                                    $add(sum, group, weights)
+                                };
                             }
                         }
                     }
@@ -79,7 +84,8 @@ macro_rules! products {
 
             for outputs in &product.weights.panels {
                 match outputs.vectors {
-                    $($vectors => panel::<$vectors>(&mut product, outputs),)*
+                    $($vectors if outputs.ends_with_half => panel::<$vectors, true>(&mut product, outputs),)*
+                    $($vectors => panel::<$vectors, false>(&mut product, outputs),)*
                     others => unreachable!("{others} vectors of outputs are a bug"),
                 }
             }
