@@ -86,6 +86,11 @@ fn settings_that_do_not_fit_the_network_or_the_camera_are_refused() {
             "sequence.short_share is for the flow network only; it must be 0 where model.architecture is dense",
         ),
         (
+            "moving-flow",
+            "sequence.feedback=teacher-forcing",
+            "sequence.feedback is for the dense network only; it must be prediction where model.architecture is flow",
+        ),
+        (
             "moving-mnist",
             "sequence={ short_share = 0.5, short_horizon = 6 }",
             "sequence.short_share is for the flow network only; it must be 0 where model.architecture is sprites",

@@ -177,7 +177,7 @@ mod tests {
     use std::time::Duration;
 
     use super::*;
-    use crate::serving::test_model;
+    use crate::serving::{test_flow_model, test_model};
 
     type Answer = oneshot::Receiver<Result<Prediction, ServingError>>;
 
@@ -228,6 +228,23 @@ mod tests {
         }
         assert!(matches!(queue.next_work(), WorkItem::Batch(batch) if batch.len() == 2));
         assert!(matches!(queue.next_work(), WorkItem::Batch(batch) if batch.len() == 1));
+    }
+
+    #[test]
+    fn windows_of_a_flow_network_are_computed_one_for_each_core() {
+        let (queue, model) = (Queue::new(8, 8), Arc::new(test_flow_model()));
+        let (requests, _answers): (Vec<_>, Vec<_>) = (0..5).map(|_| request(&model)).unzip();
+        for request in requests {
+            queue.push(request).unwrap();
+        }
+        let on_cores = |cores| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(cores).build().unwrap();
+            let WorkItem::Batch(batch) = pool.install(|| queue.next_work()) else {
+                panic!()
+            };
+            batch.len()
+        };
+        assert_eq!([1, 3, 3].map(on_cores), [1, 3, 1]);
     }
 
     #[test]

@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 use super::{AvailableInputs, check_parts, default_parts, is_one};
 use crate::jobs::JobError;
 use foreframe_core::types::{DatasetName, Seed};
+use foreframe_data::dataset::moving_mnist::MOVING_MNIST;
 use foreframe_data::dataset::{self, CollectConfig, CollectionStatus, DEFAULT_TRIALS_PER_SHARD, DatasetError};
 use foreframe_sim::{RoomSet, Scenario, SimError};
 
@@ -115,8 +116,17 @@ impl CollectSpec {
     /// The configuration of the collection, into a directory below `datasets`. Errors: `Invalid`, which names the scenarios.
     pub(in crate::jobs) fn config(&self, datasets: &Path) -> Result<CollectConfig, JobError> {
         let scenario = self.scenario.parse();
-        let scenario: Scenario =
-            scenario.map_err(|error: SimError| JobError::invalid("scenario", error.to_string()))?;
+        let scenario: Scenario = scenario.map_err(|error: SimError| {
+            let reason = if self.scenario == MOVING_MNIST {
+                format!(
+                    "{MOVING_MNIST} is made of a file of digits, which a job does not have; collect it on the command line: foreframe \
+                     collect --scenario {MOVING_MNIST} --digits FILE"
+                )
+            } else {
+                error.to_string()
+            };
+            JobError::invalid("scenario", reason)
+        })?;
         let mut config = CollectConfig::new(scenario, self.trials, Seed(self.seed), &datasets.join(&self.name));
         config.world.rooms = self.rooms;
         config.world.true_pose = self.true_pose;
@@ -145,6 +155,17 @@ mod tests {
         }
         assert_eq!(spec(50, 8).parts(), []);
         assert_eq!(spec(500, 1).parts(), []);
+    }
+
+    #[test]
+    fn digits_are_collected_on_the_command_line_only() {
+        let spec = serde_json::json!({"name": "a", "scenario": "moving-mnist", "trials": 1});
+        let collect: CollectSpec = serde_json::from_value(spec).unwrap();
+        let error = collect.config(Path::new("datasets")).unwrap_err().to_string();
+        assert!(
+            error.contains("foreframe collect --scenario moving-mnist --digits FILE"),
+            "{error}"
+        );
     }
 
     #[test]

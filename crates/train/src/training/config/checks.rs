@@ -1,6 +1,6 @@
 //! The ranges of all settings of a training, and which settings others must allow.
 
-use super::{Mirror, TrainConfig, WindowBudget};
+use super::{Mirror, TrainConfig, TrainingFeedback, WindowBudget};
 use crate::training::TrainError;
 use crate::training::optimizer::UpdateRule;
 use foreframe_core::nn::{ArchitectureKind, Conditioning};
@@ -87,11 +87,14 @@ impl TrainConfig {
         let (run, sequence) = (&self.run, &self.sequence);
         let architecture = self.model.architecture.kind();
         let uses_muon = run.optimizer == UpdateRule::Muon && architecture == ArchitectureKind::Dense;
+        let is_forced =
+            sequence.feedback == TrainingFeedback::TeacherForcing && architecture != ArchitectureKind::Dense;
         let counts_few = sequence.short_share > 0.0 && architecture != ArchitectureKind::Flow;
         let of_flow = [sequence.scene_weight, sequence.movers_weight, sequence.speeds_weight];
         let [scene, movers, speeds] = of_flow.map(|weight| weight > 0.0 && architecture == ArchitectureKind::Sprites);
         let of_others = [
             ("run.optimizer", uses_muon, "the flow and sprite networks", "adam"),
+            ("sequence.feedback", is_forced, "the dense network", "prediction"),
             ("sequence.short_share", counts_few, "the flow network", "0"),
             ("sequence.scene_weight", scene, "the flow network", "0"),
             ("sequence.movers_weight", movers, "the flow network", "0"),
