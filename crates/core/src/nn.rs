@@ -15,7 +15,7 @@
 //! `plain_agreement` tests that both give the same predictions and gradients.
 //!
 //! The modules in reading order; each uses only those above it: `options` (enumerations) → [`error`] → [`device`], [`precision`] →
-//! [`tensors`] → `fused` (what an operation with a gradient of its own is) → `ops` (such operations) → `plain` → [`loss`], [`ssim_loss`], [`mask_loss`] →
+//! [`tensors`] → `recycled` (buffers that serve again) → `fused` (what an operation with a gradient of its own is) → `ops` (such operations) → `plain` → [`loss`], [`ssim_loss`], [`mask_loss`] →
 //! [`spec`] (sizes and meaning of a model) → `model_tensors`, `conditioning` (actions and state) → `geometry` (cameras and wheels) → [`dense`], [`flow`], [`sprites`] → `model_size` (tensors and cost) → `init`, [`parameters`] →
 //! [`network`]. [`costs`] compares the model's cost with other networks.
 
@@ -42,6 +42,7 @@ mod plain;
 #[cfg(test)]
 mod plain_agreement;
 pub mod precision;
+mod recycled;
 pub mod spec;
 pub mod sprites;
 pub mod ssim_loss;

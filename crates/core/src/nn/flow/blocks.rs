@@ -18,16 +18,18 @@ pub(super) const BLOCK_PIXELS: usize = MOVED_CHANNELS - 1;
 /// An item's places on the grid of a quarter of the sides `[H/4, W/4, 2]`, as the means of the middles of their 4×4 blocks.
 pub(super) fn coarse_places(places: PixelPlaces, size: ImageSize) -> Vec<f32> {
     let quarter = size.shrunk(4);
-    let coarse = (0..quarter.pixels()).flat_map(|place| {
-        let (row, column) = (place / quarter.width, place % quarter.width);
-        let at = |dy: usize, dx: usize| places.at((4 * row + dy) * size.width + 4 * column + dx);
-        let middles = [at(1, 1), at(2, 2), at(1, 2), at(2, 1)];
-        [0, 1].map(|axis| {
-            let middle = (middles[0][axis] + middles[1][axis] + middles[2][axis] + middles[3][axis]) / 4.0;
-            (middle - 1.5) / 4.0
-        })
-    });
-    coarse.collect()
+    let mut coarse = vec![0.0; 2 * quarter.pixels()];
+    for (row, coarse) in coarse.chunks_exact_mut(2 * quarter.width).enumerate() {
+        for (column, coarse) in coarse.as_chunks_mut::<2>().0.iter_mut().enumerate() {
+            let at = |dy: usize, dx: usize| places.at((4 * row + dy) * size.width + 4 * column + dx);
+            let middles = [at(1, 1), at(2, 2), at(1, 2), at(2, 1)];
+            for (axis, coarse) in coarse.iter_mut().enumerate() {
+                let middle = (middles[0][axis] + middles[1][axis] + middles[2][axis] + middles[3][axis]) / 4.0;
+                *coarse = (middle - 1.5) / 4.0;
+            }
+        }
+    }
+    coarse
 }
 
 /// Samples a frame at the places and writes each 2×2 block to four channels of its place, from channel `first` on.

@@ -173,7 +173,9 @@ impl FlowNetwork {
         let seen = SeenPlaces::of(places, size)?;
         let warped = sample_features(&depths.coarse, seen.coarse.clone(), &context_of)?;
         let beside = seen.beside_features(&depths.views, &context_of, size)?;
-        let state = per_place(&self.mix, &joined([&warped, &beside])?)?;
+        let mixed = joined([&warped, &beside])?;
+        let state = per_place(&self.mix, &mixed)?;
+        self.recycle([&warped, &beside, &mixed])?;
         let state = self.refined(state, &ahead.modulation()?)?;
         Ok(SeenAhead {
             context_of,
@@ -225,6 +227,7 @@ impl FlowNetwork {
         if let (Some(memory), Some(recalled)) = (memory, &recalled) {
             frames = memory.mix(&frames, &fine, recalled)?;
         }
+        self.recycle([&state, &moved, &beside, &fine, &head, &seen.places])?;
         let frames = levels.intensities(&frames)?;
         Ok(PredictedAhead {
             frames: frames.reshape(shape)?,

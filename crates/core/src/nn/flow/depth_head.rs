@@ -18,7 +18,7 @@ use crate::nn::ops::joining::joined_to_shuffled;
 use crate::nn::ops::linear::{Linear, per_place};
 use crate::nn::ops::modulation::silu;
 use crate::nn::ops::pixel_shuffle::pixel_shuffle;
-use crate::nn::ops::sampling::{ImageSize, PixelPlaces, own_places};
+use crate::nn::ops::sampling::{ImageSize, PixelPlaces};
 use crate::nn::precision::Precision;
 use crate::nn::tensors::with_values;
 use crate::vectorized::{vectorized, vectorized_by};
@@ -152,14 +152,17 @@ impl SeenPlaces {
         let (half, quarter) = (size.shrunk(2), size.shrunk(4));
         let mut values = Vec::with_capacity(context_of.len() * quarter.pixels() * MIXED_VALUES);
         for (item, &context) in context_of.iter().enumerate() {
-            let known = &views.known[context as usize * half.pixels() * KNOWN_VALUES..];
-            let seen = &self.coarse[item * quarter.pixels() * 2..];
-            for (place, own) in own_places(quarter).chunks_exact(2).enumerate() {
-                // The upper left block of the place's four.
-                let block = 2 * own[1] as usize * half.width + 2 * own[0] as usize;
-                values.extend_from_slice(&known[block * KNOWN_VALUES..(block + 1) * KNOWN_VALUES]);
-                let is_seen = quarter.shows([seen[2 * place], seen[2 * place + 1]]);
-                values.push(f32::from(u8::from(is_seen)));
+            let known = &views.known[context as usize * half.pixels() * KNOWN_VALUES..][..half.pixels() * KNOWN_VALUES];
+            let (known, seen) = (
+                known.as_chunks::<KNOWN_VALUES>().0,
+                &self.coarse[item * quarter.pixels() * 2..],
+            );
+            // The upper left block of each place's four.
+            let rows = known.chunks_exact(half.width).step_by(2);
+            let places = rows.flat_map(|row| row.iter().step_by(2)).zip(seen.as_chunks::<2>().0);
+            for ([column, row, inverse], &seen) in places {
+                let is_seen = f32::from(u8::from(quarter.shows(seen)));
+                values.extend([*column, *row, *inverse, is_seen]);
             }
         }
         Ok(Tensor::from_vec(
@@ -185,16 +188,18 @@ impl SeenPlaces {
             for ((values, places), &context) in items.zip(context_of) {
                 let known = &views.known[context as usize * half.pixels() * KNOWN_VALUES..];
                 let (room, depths) = (room_of(places, size), &places[4 * pixels..]);
-                let blocks = values
-                    .chunks_exact_mut(FINE_VALUES)
-                    .zip(known.chunks_exact(KNOWN_VALUES));
-                for (block, (values, known)) in blocks.enumerate() {
-                    // The block's upper left pixel.
-                    let pixel = 2 * (block / half.width * size.width + block % half.width);
-                    values[..KNOWN_VALUES].copy_from_slice(known);
-                    values[KNOWN_VALUES] = 1.0 / depths[pixel].max(LEAST_DEPTH_M);
-                    let outside = size.outside(room.at(pixel));
-                    values[KNOWN_VALUES + 1] = (outside / OUTSIDE_PX).min(MAX_OUTSIDE);
+                let (values, known) = (
+                    values.as_chunks_mut::<FINE_VALUES>().0,
+                    known.as_chunks::<KNOWN_VALUES>().0,
+                );
+                let rows = values.chunks_exact_mut(half.width).zip(known.chunks_exact(half.width));
+                for (row, (values, known)) in rows.enumerate() {
+                    for (column, (values, [x, y, inverse])) in values.iter_mut().zip(known).enumerate() {
+                        // The block's upper left pixel.
+                        let pixel = 2 * (row * size.width + column);
+                        let outside = (size.outside(room.at(pixel)) / OUTSIDE_PX).min(MAX_OUTSIDE);
+                        *values = [*x, *y, *inverse, 1.0 / depths[pixel].max(LEAST_DEPTH_M), outside];
+                    }
                 }
             }
         })?;

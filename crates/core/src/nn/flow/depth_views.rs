@@ -131,9 +131,21 @@ impl FrameLevels {
 /// Mean and spread of a frame.
 pub(super) fn levels(frame: &[f32]) -> [f32; 2] {
     let count = frame.len() as f32;
-    let mean = frame.iter().sum::<f32>() / count;
-    let variance = frame.iter().map(|value| (value - mean).powi(2)).sum::<f32>() / count;
+    let mean = sum_of(frame, |value| value) / count;
+    let variance = sum_of(frame, |value| (value - mean).powi(2)) / count;
     [mean, variance.sqrt().max(MIN_SPREAD)]
+}
+
+/// The sum of a function of each value, as several sums, which do not wait for each other.
+fn sum_of(values: &[f32], of: impl Fn(f32) -> f32) -> f32 {
+    let (vectors, rest) = values.as_chunks::<SAMPLED_TOGETHER>();
+    let mut sums = [0.0; SAMPLED_TOGETHER];
+    for vector in vectors {
+        for (sum, &value) in sums.iter_mut().zip(vector) {
+            *sum += of(value);
+        }
+    }
+    sums.iter().sum::<f32>() + rest.iter().map(|&value| of(value)).sum::<f32>()
 }
 
 pub(super) fn count_from(frame: &mut [f32], [mean, spread]: [f32; 2]) {

@@ -62,7 +62,8 @@ impl FlowNetwork {
         let features = scene.narrow(3, 0, SCENE_FEATURES)?;
         let mixed = joined([&warped, &pixel_unshuffle(&features)?])?;
         let state = self.refined(per_place(&self.mix, &mixed)?, &ahead.modulation()?)?;
-        let head = self.head(&self.fine(&state, [&moved, &scene], None)?)?;
+        let fine = self.fine(&state, [&moved, &scene], None)?;
+        let head = self.head(&fine)?;
 
         let composition = Composition {
             size,
@@ -71,6 +72,7 @@ impl FlowNetwork {
             room: geometry.room.map_or(RoomPlaces::Turned, RoomPlaces::Known),
         };
         let frames = composition.compose(&head, &scene, &geometry.turned)?;
+        self.recycle([&warped, &moved, &mixed, &state, &fine, &head])?;
         let content = || Ok::<_, NnError>(content_frames(&scene)?.reshape(shape)?);
         let content = (!ahead.rows.only_frames).then(content).transpose()?;
         Ok(PredictedAhead {

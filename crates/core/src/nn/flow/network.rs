@@ -19,6 +19,7 @@ use crate::nn::ops::joining::joined_to_shuffled;
 use crate::nn::ops::linear::{Linear, per_place};
 use crate::nn::ops::modulation::{perceptron, silu};
 use crate::nn::precision::Precision;
+use crate::nn::recycled::recycle;
 use crate::nn::spec::{FlowSpec, ModelSpec};
 
 /// What the network gives for a batch.
@@ -173,7 +174,9 @@ impl FlowNetwork {
         for (index, [first, second]) in self.refine.iter().enumerate() {
             let modulation = |part: usize| modulation.narrow(1, (2 * index + part) * 2 * channels, 2 * channels);
             let inner = activated_convolution(first, &state, Activation::Modulated(&modulation(0)?), None)?;
-            state = activated_convolution(second, &inner, Activation::Modulated(&modulation(1)?), Some(&state))?;
+            let refined = activated_convolution(second, &inner, Activation::Modulated(&modulation(1)?), Some(&state))?;
+            self.recycle([&inner, &state])?;
+            state = refined;
         }
         Ok(state)
     }
@@ -186,9 +189,12 @@ impl FlowNetwork {
         [moved, beside]: [&Tensor; 2],
         added: Option<&Tensor>,
     ) -> Result<Tensor, NnError> {
-        let enlarged = per_place(&self.enlarge, &silu(state)?)?;
+        let activated = silu(state)?;
+        let enlarged = per_place(&self.enlarge, &activated)?;
         let inputs = joined_to_shuffled([&enlarged, moved, beside])?;
-        Ok(activated_convolution(&self.fine, &inputs, Activation::None, added)?)
+        let fine = activated_convolution(&self.fine, &inputs, Activation::None, added)?;
+        self.recycle([&activated, &enlarged, &inputs])?;
+        Ok(fine)
     }
 
     /// The head's values `[M, H/2, W/2, 4 · HEAD_VALUES]` from those of the fine layer.
@@ -210,9 +216,22 @@ impl FlowNetwork {
         let mut coarse = activated_convolution(&self.halving, &first, Activation::None, None)?;
         for [first, second] in &self.blocks {
             let inner = activated_convolution(first, &coarse, Activation::Silu, None)?;
-            coarse = activated_convolution(second, &inner, Activation::Silu, Some(&coarse))?;
+            let next = activated_convolution(second, &inner, Activation::Silu, Some(&coarse))?;
+            self.recycle([&inner, &coarse])?;
+            coarse = next;
         }
         Ok([coarse, first])
+    }
+
+    /// Keeps the buffers of tensors that nobody reads any more for the next ones. Gradients would need what they hold, so only with packed
+    /// weights.
+    pub(super) fn recycle<const COUNT: usize>(&self, tensors: [&Tensor; COUNT]) -> Result<(), NnError> {
+        if self.stem.packed.is_some() {
+            for tensor in tensors {
+                recycle(tensor)?;
+            }
+        }
+        Ok(())
     }
 
     /// Scales and shifts of each item's modulated layers `[M, …]`.

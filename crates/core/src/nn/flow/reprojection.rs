@@ -12,6 +12,7 @@ use crate::nn::fused::{FusedOperation, Operand, apply};
 use crate::nn::geometry::camera::{Viewer, ViewerRays, rotated};
 use crate::nn::ops::gathering::{OfPlaces, SAMPLED_TOGETHER, write_together};
 use crate::nn::ops::sampling::{ImageSize, Neighbourhood, SampledImage};
+use crate::nn::recycled::buffer;
 use crate::vectorized::{Instructions, vectorized_by};
 
 /// Values of a pixel: its place before the turn, its place before turn and drive (columns and rows), its depth in metres.
@@ -159,7 +160,7 @@ impl FusedOperation<2> for Reprojection {
     fn forward(&self, [depths, motions]: [Operand; 2]) -> Result<(Vec<f32>, Shape)> {
         self.check(depths, motions)?;
         let (items, pixels) = (self.context_of.len(), self.size.pixels());
-        let mut out = vec![0.0; items * pixels * PLACE_VALUES];
+        let mut out = buffer(items * pixels * PLACE_VALUES);
         let outs = out.chunks_exact_mut(pixels * PLACE_VALUES);
         for ((out, motion), &context) in outs.zip(motions.values.chunks_exact(3)).zip(&self.context_of) {
             let context = context as usize;

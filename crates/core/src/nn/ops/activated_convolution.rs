@@ -9,6 +9,7 @@ use super::convolution::Convolution3;
 use super::image_geometry::ImageGeometry;
 use super::modulation::{modulated_silu, silu};
 use super::packed::StartSums;
+use crate::nn::recycled::buffer;
 use crate::nn::tensors::with_values;
 
 /// What is done to a convolution's input.
@@ -54,8 +55,12 @@ fn predict(
     let shape = (dims.0, image.out_height(), image.out_width(), outputs);
     let (mut out, start) = match added {
         Some(added) if added.dims4()? != shape => bail!("{:?} is not added to {shape:?}", added.dims()),
-        Some(added) => (with_values(added, <[f32]>::to_vec)?, StartSums::Output),
-        None => (vec![0.0; dims.0 * image.places() * outputs], StartSums::Bias),
+        Some(added) => {
+            let mut sums = buffer(added.elem_count());
+            with_values(added, |added| sums.copy_from_slice(added))?;
+            (sums, StartSums::Output)
+        }
+        None => (buffer(dims.0 * image.places() * outputs), StartSums::Bias),
     };
     let convolution = BorderedConvolution::in_strips(packed, image, rayon::current_num_threads());
     let mut convolve = |x: &[f32], modulations: &[f32]| {

@@ -5,6 +5,7 @@
 use candle_core::{Result, Shape, Tensor, bail};
 
 use crate::nn::fused::{FusedOperation, Operand, apply};
+use crate::nn::recycled::buffer;
 use crate::vectorized::vectorized;
 
 /// The channels of images `[N, H, W, …]`, one after another.
@@ -94,7 +95,7 @@ impl<const COUNT: usize> FusedOperation<COUNT> for Joining {
     fn forward(&self, images: [Operand; COUNT]) -> Result<(Vec<f32>, Shape)> {
         let (sources, [count, height, width]) = self.sources(images)?;
         let channels: usize = sources.iter().map(|source| source.channels).sum();
-        let mut out = vec![0.0; count * height * width * channels];
+        let mut out = buffer(count * height * width * channels);
         let rows = out.chunks_exact_mut(width * channels).enumerate();
         vectorized(
             #[inline(always)]

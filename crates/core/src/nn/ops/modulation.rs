@@ -9,6 +9,7 @@ use super::activation::sigmoid_with;
 use super::linear::Linear;
 use super::row_weights::RowWeights;
 use crate::nn::fused::{FusedOperation, Operand, apply};
+use crate::nn::recycled::buffer;
 use crate::nn::tensors::with_values;
 use crate::vectorized::{Instructions, vectorized_by};
 
@@ -106,7 +107,7 @@ impl FusedOperation<1> for Silu {
     const NAME: &'static str = "silu";
 
     fn forward(&self, [x]: [Operand; 1]) -> Result<(Vec<f32>, Shape)> {
-        let mut values = vec![0.0; x.values.len()];
+        let mut values = buffer(x.values.len());
         // Not `collect`: it is not inlined, so its loop would do without vector instructions.
         vectorized_by(
             #[inline(always)]

@@ -7,6 +7,7 @@ use candle_core::{Result, Tensor};
 use super::packed::PackedWeights;
 use super::reduced::ReducedWeights;
 use crate::nn::precision::Precision;
+use crate::nn::recycled::buffer;
 use crate::nn::tensors::with_values;
 
 /// The sum of so many products of a byte and a signed one, 255 · 127 each at most, fits 32 bits.
@@ -55,7 +56,7 @@ impl RowWeights {
 
     /// The sums of that many rows.
     pub(in crate::nn) fn times(&self, values: &[f32], rows: usize) -> Vec<f32> {
-        let mut out = vec![0.0; rows * self.outputs()];
+        let mut out = buffer(rows * self.outputs());
         self.multiply_rows(values, &mut out);
         out
     }

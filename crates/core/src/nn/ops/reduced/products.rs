@@ -46,9 +46,17 @@ macro_rules! products {
                 let weights = panel.weights.as_chunks::<VECTORS>().0;
                 let ranges = product.inputs.ranges_of::<PLACES>(place);
                 let mut sums = [[$start(ranges[0], panel, 0); VECTORS]; PLACES];
-                for at in 0..PLACES {
-                    for vector in 0..VECTORS {
-                        sums[at][vector] = $start(ranges[at], panel, vector);
+                for vector in 1..VECTORS {
+                    let of_first = $start(ranges[0], panel, vector);
+                    for at in 0..PLACES {
+                        sums[at][vector] = of_first;
+                    }
+                }
+                if product.inputs.ranges.len() > 1 {
+                    for at in 1..PLACES {
+                        for vector in 0..VECTORS {
+                            sums[at][vector] = $start(ranges[at], panel, vector);
+                        }
                     }
                 }
                 for run in runs {
