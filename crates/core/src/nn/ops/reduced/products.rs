@@ -46,17 +46,9 @@ macro_rules! products {
                 let weights = panel.weights.as_chunks::<VECTORS>().0;
                 let ranges = product.inputs.ranges_of::<PLACES>(place);
                 let mut sums = [[$start(ranges[0], panel, 0); VECTORS]; PLACES];
-                for vector in 1..VECTORS {
-                    let of_first = $start(ranges[0], panel, vector);
-                    for at in 0..PLACES {
-                        sums[at][vector] = of_first;
-                    }
-                }
-                if product.inputs.ranges.len() > 1 {
-                    for at in 1..PLACES {
-                        for vector in 0..VECTORS {
-                            sums[at][vector] = $start(ranges[at], panel, vector);
-                        }
+                for at in 0..PLACES {
+                    for vector in 0..VECTORS {
+                        sums[at][vector] = $start(ranges[at], panel, vector);
                     }
                 }
                 for run in runs {
@@ -71,11 +63,8 @@ macro_rules! products {
                             let group = $group(inputs[at][input]);
                             for vector in 0..VECTORS {
                                 let (sum, weights) = (sums[at][vector], $weights(weights[vector]));
-                                sums[at][vector] = if HALF && vector + 1 == VECTORS {
-                                    $add_half(sum, group, weights)
-                                } else {
-                                    $add(sum, group, weights)
-                                };
+                                let adds = if HALF && vector + 1 == VECTORS { $add_half } else { $add };
+                                sums[at][vector] = adds(sum, group, weights);
                             }
                         }
                     }
