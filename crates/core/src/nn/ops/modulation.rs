@@ -152,7 +152,7 @@ impl FusedOperation<2> for ModulatedSilu {
                     let (scale, shift) = modulation.split_at(channels);
                     for row in values.chunks_exact_mut(channels) {
                         for ((value, scale), shift) in row.iter_mut().zip(scale).zip(shift) {
-                            *value = activate(*value * (1.0 + scale) + shift, instructions);
+                            *value = activate(instructions.multiply_add(*value, 1.0 + scale, *shift), instructions);
                         }
                     }
                 }
@@ -196,7 +196,11 @@ fn item_gradient([x, modulation]: [&[f32]; 2], gradient: &mut [f32], sums: &mut 
     for (gradient, x) in gradient.chunks_exact_mut(channels).zip(x.chunks_exact(channels)) {
         for channel in 0..channels {
             let gain = 1.0 + scale[channel];
-            let inner = gradient[channel] * slope(x[channel] * gain + shift[channel], instructions);
+            let inner = gradient[channel]
+                * slope(
+                    instructions.multiply_add(x[channel], gain, shift[channel]),
+                    instructions,
+                );
             scale_sums[channel] += inner * x[channel];
             shift_sums[channel] += inner;
             gradient[channel] = inner * gain;
