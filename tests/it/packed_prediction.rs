@@ -68,6 +68,21 @@ fn packed_weights_predict_what_the_tensors_predict() {
 }
 
 #[test]
+fn what_a_thread_predicted_before_changes_nothing() {
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
+    let networks = ["home", "static-flow", "moving-flow", "rooms"].map(packed);
+    let predicted = |network: &Network| {
+        let spec = network.spec();
+        let (frames, plans) = (frames(spec, 1), plans(spec, 1));
+        pool.install(|| network.predict_rollouts(&frames, &[0], &plans).unwrap())
+    };
+    let [alone, again] = [0, 1].map(|_| networks.iter().map(predicted).collect::<Vec<_>>());
+    for (alone, again) in alone.iter().zip(&again) {
+        assert_eq!(largest_difference(alone, again), 0.0);
+    }
+}
+
+#[test]
 fn fewer_bits_predict_nearly_the_same() {
     for name in ["static", "moving", "moving-flow", "rooms", "home", "static-flow"] {
         let on_tensors = on_tensors(name);

@@ -33,7 +33,7 @@ impl Instructions {
     #[cfg(test)]
     pub(crate) const PLAIN: Self = Self { lanes: 1 };
 
-    /// a · b + c, rounded once where one instruction does it: elsewhere, that would take a call.
+    /// a · b + c. Rounded once where the processor has an instruction for it; elsewhere in two steps, since `mul_add` would be a call.
     #[inline(always)]
     pub(crate) fn multiply_add(self, a: f32, b: f32, c: f32) -> f32 {
         if cfg!(target_arch = "aarch64") || self.lanes >= 8 {

@@ -5,10 +5,10 @@ use std::cell::Cell;
 
 use candle_core::{CpuStorage, InplaceOp1, Layout, Result, Tensor};
 
-/// Buffers that a thread keeps. A prediction has about 20 sizes.
-const MOST_BUFFERS: usize = 32;
-/// Values of the largest that it keeps: of 1 MiB.
-const MOST_VALUES: usize = 1 << 18;
+/// Buffers that a thread keeps.
+const MOST_BUFFERS: usize = 16;
+/// Values of the largest that it keeps: of 512 KiB, four times as large as those of frames of 64×64 px.
+const MOST_VALUES: usize = 1 << 17;
 
 thread_local! {
     static KEPT: Cell<Vec<Vec<f32>>> = const { Cell::new(Vec::new()) };

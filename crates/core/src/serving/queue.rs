@@ -245,6 +245,13 @@ mod tests {
             batch.len()
         };
         assert_eq!([1, 3, 3].map(on_cores), [1, 3, 1]);
+        let narrow = Queue::new(8, 2);
+        let (requests, _answers): (Vec<_>, Vec<_>) = (0..3).map(|_| request(&model)).unzip();
+        for request in requests {
+            narrow.push(request).unwrap();
+        }
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(3).build().unwrap();
+        assert!(matches!(pool.install(|| narrow.next_work()), WorkItem::Batch(batch) if batch.len() == 2));
     }
 
     #[test]

@@ -142,7 +142,7 @@ pub struct SequenceConfig {
     pub loss: Loss,
     /// The target frames of the decoder, in both stages.
     pub target: Target,
-    /// What the predictor gets as the previous frame in training, after its first step.
+    /// What the predictor gets as the previous frame in training, after its first step; `"prediction"` unless the network is dense.
     pub feedback: TrainingFeedback,
     /// Weight of the reconstruction loss; the prediction loss has weight 1. With 0, the reconstruction decoder is not
     /// trained. The sprite network learns what its sprites look like from this loss, so there it must be above 0.

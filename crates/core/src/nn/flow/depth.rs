@@ -175,7 +175,7 @@ impl FlowNetwork {
         let beside = seen.beside_features(&depths.views, &context_of, size)?;
         let mixed = joined([&warped, &beside])?;
         let state = per_place(&self.mix, &mixed)?;
-        self.recycle([&warped, &beside, &mixed])?;
+        self.recycle([&warped, &mixed])?;
         let state = self.refined(state, &ahead.modulation()?)?;
         Ok(SeenAhead {
             context_of,
@@ -227,7 +227,7 @@ impl FlowNetwork {
         if let (Some(memory), Some(recalled)) = (memory, &recalled) {
             frames = memory.mix(&frames, &fine, recalled)?;
         }
-        self.recycle([&state, &moved, &beside, &fine, &head, &seen.places])?;
+        self.recycle([&state, &fine, &head, &seen.places])?;
         let frames = levels.intensities(&frames)?;
         Ok(PredictedAhead {
             frames: frames.reshape(shape)?,

@@ -72,7 +72,7 @@ impl FlowNetwork {
             room: geometry.room.map_or(RoomPlaces::Turned, RoomPlaces::Known),
         };
         let frames = composition.compose(&head, &scene, &geometry.turned)?;
-        self.recycle([&warped, &moved, &mixed, &state, &fine, &head])?;
+        self.recycle([&warped, &mixed, &state, &fine, &head])?;
         let content = || Ok::<_, NnError>(content_frames(&scene)?.reshape(shape)?);
         let content = (!ahead.rows.only_frames).then(content).transpose()?;
         Ok(PredictedAhead {

@@ -223,10 +223,10 @@ impl FlowNetwork {
         Ok([coarse, first])
     }
 
-    /// Keeps the buffers of tensors that nobody reads any more for the next ones. Gradients would need what they hold, so only with packed
-    /// weights.
+    /// Keeps the buffers of tensors that nobody reads any more for the next ones. Gradients would need what they hold, so only in
+    /// predictions.
     pub(super) fn recycle<const COUNT: usize>(&self, tensors: [&Tensor; COUNT]) -> Result<(), NnError> {
-        if self.stem.packed.is_some() {
+        if self.stem.packed.is_some() && !self.is_trained() {
             for tensor in tensors {
                 recycle(tensor)?;
             }

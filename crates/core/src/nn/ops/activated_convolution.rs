@@ -53,6 +53,11 @@ fn predict(
     let image = ImageGeometry::of(dims, layer.shape);
     let outputs = packed.outputs();
     let shape = (dims.0, image.out_height(), image.out_width(), outputs);
+    if let Activation::Modulated(modulation) = activation
+        && modulation.dims() != [dims.0, 2 * image.channels]
+    {
+        bail!("a modulation of shape {:?} does not fit {dims:?}", modulation.dims());
+    }
     let (mut out, start) = match added {
         Some(added) if added.dims4()? != shape => bail!("{:?} is not added to {shape:?}", added.dims()),
         Some(added) => {
@@ -101,13 +106,13 @@ mod tests {
             (ConvShape::dilated(2), [6, 5]),
         ] {
             let mut layer = Convolution3 {
-                weight: noise(&[27, 20], 2),
-                bias: noise(&[20], 3),
+                weight: noise(&[27, 24], 2),
+                bias: noise(&[24], 3),
                 shape,
                 packed: None,
             };
             let (x, modulation) = (noise(&[2, 6, 5, 3], 1), noise(&[2, 6], 4));
-            let added = noise(&[2, sides[0], sides[1], 20], 5);
+            let added = noise(&[2, sides[0], sides[1], 24], 5);
             let outputs = |layer: &Convolution3| {
                 let activations = [Activation::None, Activation::Silu, Activation::Modulated(&modulation)];
                 [None, Some(&added)].map(|added| {

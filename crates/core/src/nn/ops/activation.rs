@@ -26,7 +26,11 @@ pub(in crate::nn) fn sigmoid_with(x: f32, instructions: Instructions) -> f32 {
 /// e^x.
 #[inline(always)]
 pub(in crate::nn) fn exp(x: f32) -> f32 {
-    exp_by(x, |a, b, c| a * b + c)
+    exp_by(
+        x,
+        #[inline(always)]
+        |a, b, c| a * b + c,
+    )
 }
 
 /// e^x, with the instructions of the loop that it is in.

@@ -1,4 +1,4 @@
-//! Images side by side: the channels of one after those of the other. As `Tensor::cat`, in one pass over memory.
+//! Joins images along their channels, as `Tensor::cat` does, in one pass over memory.
 // A closure's vector instructions reach what is inlined into it, and only that.
 #![allow(clippy::inline_always)]
 
@@ -56,8 +56,9 @@ impl Joining {
             } else {
                 ([count, height, width], channels)
             };
-            if *sides.get_or_insert(own) != own {
-                bail!("an image of {own:?} is not joined to one of {sides:?}");
+            let first = *sides.get_or_insert(own);
+            if first != own || is_shuffled && image.dims()[3] % 4 != 0 {
+                bail!("an image of {:?} is not joined to one of {first:?}", image.dims());
             }
             *source = Source { channels, is_shuffled };
         }
@@ -151,8 +152,8 @@ mod tests {
 
     #[test]
     fn images_are_joined_as_tensors_are() {
-        for channels in [[4, 5, 5], [16, 17, 9], [3, 1, 40], [65, 8, 64]] {
-            let image = |nth: usize| noise(&[2, 6, 4, channels[nth]], nth as u64);
+        for (width, channels) in [(4, [4, 5, 5]), (5, [16, 17, 9]), (4, [3, 1, 40]), (3, [65, 8, 64])] {
+            let image = |nth: usize| noise(&[2, 6, width, channels[nth]], nth as u64);
             let (first, second, third) = (image(0), image(1), image(2));
             let expected = Tensor::cat(&[&first, &second, &third], 3).unwrap();
             assert_eq!(values(&joined([&first, &second, &third]).unwrap()), values(&expected));
@@ -163,14 +164,19 @@ mod tests {
             values(&joined_to_shuffled([&enlarged, &beside]).unwrap()),
             values(&expected)
         );
+        let known = noise(&[2, 6, 4, 3], 3);
         assert_gradients(&[enlarged, beside], 1e-2, |inputs| {
-            joined_to_shuffled([&inputs[0], &inputs[1]])
+            joined_to_shuffled([&inputs[0], &known, &inputs[1]])
         });
     }
 
     #[test]
     fn images_of_other_sides_are_refused() {
-        let error = joined([&noise(&[1, 2, 3, 4], 1), &noise(&[1, 3, 2, 4], 1)]).unwrap_err();
-        assert!(error.to_string().contains("is not joined"), "{error}");
+        let refused = |joined: Result<Tensor>| joined.unwrap_err().to_string().contains("is not joined");
+        assert!(refused(joined([&noise(&[1, 2, 3, 4], 1), &noise(&[1, 3, 2, 4], 1)])));
+        assert!(refused(joined_to_shuffled([
+            &noise(&[1, 2, 3, 6], 1),
+            &noise(&[1, 4, 6, 4], 1)
+        ])));
     }
 }

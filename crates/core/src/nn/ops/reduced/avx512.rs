@@ -75,7 +75,7 @@ fn finish_halves(sum: __m512, _: ByteRange, panel: &ReducedPanel, vector: usize)
     floats(_mm512_add_ps(sum, float_bits(panel.bias[vector])))
 }
 
-/// As [`products::first_sums`].
+/// As [`products::first_sums`], in instructions that the compiler surely takes: other loops would be called, and pass vectors through memory.
 #[target_feature(enable = "avx512f")]
 #[inline]
 fn first_sums(range: ByteRange, panel: &ReducedPanel, vector: usize) -> __m512i {
@@ -83,7 +83,7 @@ fn first_sums(range: ByteRange, panel: &ReducedPanel, vector: usize) -> __m512i 
     _mm512_mullo_epi32(whole_bits(panel.weight_sums[vector]), zero)
 }
 
-/// As [`products::dequantized`].
+/// As [`products::dequantized`], in instructions too.
 #[target_feature(enable = "avx512f")]
 #[inline]
 fn finish_bytes(sum: __m512i, range: ByteRange, panel: &ReducedPanel, vector: usize) -> Register<f32> {

@@ -8,7 +8,7 @@ use crate::nn::ops::packed::StartSums;
 /// A function that computes a product with instructions of its own. `places 8 then 4, vectors 1 2 3`: the sums of 8 places stay in
 /// registers while the inputs and weights pass by, for as many vectors of outputs as a panel has, which is 1, 2 or 3; what is left is
 /// computed for 4 places at once, then for each alone. The sums of a vector begin with what `start` gives, and `finish` turns them into
-/// values. Where half of a panel's last vector has no outputs, `add_half` is taken, which may leave it out.
+/// values. Where half of a panel's last vector has no outputs, `add_half` is taken, which may leave that half out.
 macro_rules! products {
     (
         fn $name:ident, $features:literal, places $places:literal then $fewer:literal, vectors $($vectors:literal)*,
@@ -45,6 +45,7 @@ macro_rules! products {
                 } = product.inputs;
                 let weights = panel.weights.as_chunks::<VECTORS>().0;
                 let ranges = product.inputs.ranges_of::<PLACES>(place);
+                // Of the right type; each is set below.
                 let mut sums = [[$start(ranges[0], panel, 0); VECTORS]; PLACES];
                 for at in 0..PLACES {
                     for vector in 0..VECTORS {
