@@ -108,7 +108,8 @@ settings! {
     max_frames: usize = 64, 1..=4096;
     /// Maximum number of predictions that wait; more are refused with 503.
     max_queued_predictions: usize = 256, 1..=MAX_COUNT;
-    /// Maximum number of rollouts in a batch; one request gets at most a quarter of a batch. On the CPU, flow and sprite
+    /// Maximum number of rollouts in a batch; one request gets at most a quarter of a batch, and
+    /// less where its rollouts are longer than the horizon. On the CPU, flow and sprite
     /// networks gain nothing from batches: at most one rollout for each core, or one larger request, is computed at a time.
     max_batch: usize = 64, 1..=4096;
     /// Maximum size of all request bodies and messages of streams that the server reads or works with at the same time, in

@@ -123,12 +123,13 @@ impl Predictor {
         let deadline = Instant::now() + self.shared.deadline;
         let mut warnings = std::mem::take(&mut task.warnings);
         warnings.extend(range_warnings(&model.manifest, &task.conditioning_inputs));
-        let first = task.next_part(self.shared.part_limit);
+        let part_limit = task.rollouts_of_part(self.shared.part_limit, model.spec());
+        let first = task.next_part(part_limit);
         let mut whole = self.compute_part(model, first, session, deadline).await?;
         // The first part has encoded the frames; the others predict from their features.
         task.past_features.extend(whole.features.iter().cloned());
         while !task.conditioning_inputs.is_empty() {
-            let part = task.next_part(self.shared.part_limit);
+            let part = task.next_part(part_limit);
             whole.append(self.compute_part(model, part, session, deadline).await?);
         }
         whole.warnings = warnings;
@@ -215,6 +216,21 @@ mod tests {
             frames: input.frames,
             ..Task::default()
         }
+    }
+
+    #[test]
+    fn a_part_has_fewer_rollouts_where_they_are_longer() {
+        let model = test_model();
+        let of_part = |steps| {
+            let mut task = task(&model);
+            task.conditioning_inputs[0].steps = steps;
+            task.rollouts_of_part(16, model.spec())
+        };
+        // The horizon has two steps.
+        assert_eq!(
+            [None, Some(1), Some(2), Some(3), Some(8), Some(100)].map(of_part),
+            [16, 16, 16, 8, 4, 1]
+        );
     }
 
     #[tokio::test]

@@ -7,6 +7,7 @@ use super::error::InputError;
 use super::past_errors::PastErrors;
 use crate::frame::Frame;
 use crate::frame::warp::CameraModel;
+use crate::nn::ModelSpec;
 use crate::registry::Manifest;
 use crate::types::RobotState;
 
@@ -73,6 +74,14 @@ impl Task {
     pub fn after_gap(mut self) -> Self {
         self.past_errors.skip();
         self
+    }
+
+    /// How many rollouts are computed in a part that may have so many of the horizon's length. Longer ones take as many times as long, and
+    /// other requests wait for a part.
+    pub(super) fn rollouts_of_part(&self, limit: usize, spec: &ModelSpec) -> usize {
+        let steps = self.conditioning_inputs.iter().map(|input| input.steps(spec)).max();
+        let horizons = steps.unwrap_or(1).div_ceil(spec.horizon.max(1)).max(1);
+        (limit / horizons).max(1)
     }
 
     /// Splits off what is computed next: the frames, and the first rollouts up to a limit.
