@@ -226,11 +226,11 @@ mod tests {
     fn depths_are_multiplied_by_what_is_learned() {
         let (learned, before) = (noise(&[2, 30], 1), (noise(&[2, 30], 2) + 2.0).unwrap());
         let deepened = |learned: &Tensor| apply(Deepened, [learned, &before]);
-        let expected = (((learned.tanh().unwrap() * MAX_LOGARITHM).unwrap().exp().unwrap()) * &before).unwrap();
-        let pairs = values(&deepened(&learned).unwrap()).into_iter().zip(values(&expected));
-        pairs
-            .into_iter()
-            .for_each(|(found, expected)| assert!((found / expected - 1.0).abs() < 2e-6, "{found} {expected}"));
+        let factors = (learned.tanh().unwrap() * MAX_LOGARITHM).unwrap().exp().unwrap();
+        let expected = values(&(factors * &before).unwrap());
+        for (found, expected) in values(&deepened(&learned).unwrap()).into_iter().zip(expected) {
+            assert!((found / expected - 1.0).abs() < 2e-6, "{found} {expected}");
+        }
         assert_gradients(&[learned], 1e-2, |inputs| deepened(&inputs[0]));
     }
 }

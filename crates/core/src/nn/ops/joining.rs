@@ -31,7 +31,8 @@ struct Source {
 }
 
 impl Source {
-    /// Where the channels of a row's first place begin, and how far it is from there to those of the next place, and from these on.
+    /// Where the channels of a row's first place begin; how far it is from there to those of the second place, and from these to those of
+    /// the third; then both distances take turns.
     #[inline(always)]
     fn row(self, row: usize, width: usize) -> (usize, [usize; 2]) {
         let channels = self.channels;

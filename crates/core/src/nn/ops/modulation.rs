@@ -196,11 +196,8 @@ fn item_gradient([x, modulation]: [&[f32]; 2], gradient: &mut [f32], sums: &mut 
     for (gradient, x) in gradient.chunks_exact_mut(channels).zip(x.chunks_exact(channels)) {
         for channel in 0..channels {
             let gain = 1.0 + scale[channel];
-            let inner = gradient[channel]
-                * slope(
-                    instructions.multiply_add(x[channel], gain, shift[channel]),
-                    instructions,
-                );
+            let modulated = instructions.multiply_add(x[channel], gain, shift[channel]);
+            let inner = gradient[channel] * slope(modulated, instructions);
             scale_sums[channel] += inner * x[channel];
             shift_sums[channel] += inner;
             gradient[channel] = inner * gain;

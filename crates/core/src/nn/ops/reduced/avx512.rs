@@ -75,7 +75,7 @@ fn finish_halves(sum: __m512, _: ByteRange, panel: &ReducedPanel, vector: usize)
     floats(_mm512_add_ps(sum, float_bits(panel.bias[vector])))
 }
 
-/// As [`products::first_sums`], in instructions that the compiler surely takes: other loops would be called, and pass vectors through memory.
+/// As [`products::first_sums`], in instructions. The compiler does not inline the loop everywhere, and would pass vectors through memory.
 #[target_feature(enable = "avx512f")]
 #[inline]
 fn first_sums(range: ByteRange, panel: &ReducedPanel, vector: usize) -> __m512i {
@@ -83,7 +83,7 @@ fn first_sums(range: ByteRange, panel: &ReducedPanel, vector: usize) -> __m512i 
     _mm512_mullo_epi32(whole_bits(panel.weight_sums[vector]), zero)
 }
 
-/// As [`products::dequantized`], in instructions too.
+/// As [`products::dequantized`], in instructions for the same reason.
 #[target_feature(enable = "avx512f")]
 #[inline]
 fn finish_bytes(sum: __m512i, range: ByteRange, panel: &ReducedPanel, vector: usize) -> Register<f32> {
