@@ -48,50 +48,63 @@ impl Preprocess {
     /// Converts values of the model back to camera intensities, clamped to 0…1.
     #[must_use]
     pub fn inverse(&self, values: &[f32]) -> Vec<f32> {
-        let mut restored: Vec<f32> = values.iter().map(|value| value.clamp(0.0, 1.0)).collect();
-        if self.invert {
-            invert_intensity(&mut restored);
-        }
-        restored
+        vectorized(
+            #[inline(always)]
+            || values.iter().map(|value| self.intensity(*value)).collect(),
+        )
     }
 
     /// Converts values of the model back to a frame. Errors: `NotFinite` at a NaN or infinity, `PixelCount`, `Size`.
     pub fn frame_from(&self, values: &[f32], width: u32, height: u32) -> Result<Frame, FrameError> {
-        // `fold` has no early exit, so the compiler can vectorize it. The search by index runs only after a failure.
-        let all_finite = values.iter().fold(true, |all, value| all & value.is_finite());
+        let mut pixels = vec![0; values.len()];
+        let all_finite = vectorized(
+            #[inline(always)]
+            || {
+                for (pixel, value) in pixels.iter_mut().zip(values) {
+                    // `whole` cuts the fraction off, so adding 0.5 rounds.
+                    *pixel = whole(self.intensity(*value) * 255.0 + 0.5) as u8;
+                }
+                // `fold` has no early exit, so the compiler can vectorize it.
+                values.iter().fold(true, |all, value| all & value.is_finite())
+            },
+        );
+        // The search by index runs only after a failure.
         if !all_finite && let Some(index) = values.iter().position(|value| !value.is_finite()) {
             return Err(FrameError::NotFinite {
                 index,
                 value: values[index],
             });
         }
-        let mut pixels = vec![0; values.len()];
-        vectorized(
-            #[inline(always)]
-            || {
-                for (pixel, value) in pixels.iter_mut().zip(values) {
-                    let value = value.clamp(0.0, 1.0);
-                    let intensity = if self.invert { 1.0 - value } else { value };
-                    // `whole` cuts the fraction off, so adding 0.5 rounds.
-                    *pixel = whole(intensity * 255.0 + 0.5) as u8;
-                }
-            },
-        );
         Frame::new(width, height, pixels)
+    }
+
+    /// The intensity of the camera that a value of the model stands for, 0…1.
+    #[inline(always)]
+    fn intensity(&self, value: f32) -> f32 {
+        let value = value.clamp(0.0, 1.0);
+        if self.invert { 1.0 - value } else { value }
     }
 }
 
 /// Scales 8-bit intensities to 0…1.
 #[must_use]
 pub fn scale(pixels: &[u8]) -> Vec<f32> {
-    pixels.iter().map(|&value| f32::from(value) / 255.0).collect()
+    vectorized(
+        #[inline(always)]
+        || pixels.iter().map(|&value| f32::from(value) / 255.0).collect(),
+    )
 }
 
 /// Inverts intensities that are scaled to 0…1: I = 1 − I.
 pub fn invert_intensity(values: &mut [f32]) {
-    for value in values {
-        *value = 1.0 - *value;
-    }
+    vectorized(
+        #[inline(always)]
+        || {
+            for value in values {
+                *value = 1.0 - *value;
+            }
+        },
+    );
 }
 
 /// A normalized Gaussian kernel of `2 · radius + 1` weights.
@@ -127,16 +140,24 @@ fn rows_then_columns(values: &[f32], width: usize, kernel: &[f32]) -> Vec<f32> {
         padded[..radius].fill(row[0]);
         padded[radius..radius + width].copy_from_slice(row);
         padded[radius + width..].fill(row[width - 1]);
-        for (tap, weight) in kernel.iter().enumerate() {
-            add_scaled(out, &padded[tap..tap + width], *weight);
-        }
+        weighted_sums(
+            out,
+            kernel,
+            #[inline(always)]
+            |tap| &padded[tap..tap + width],
+        );
     }
     let mut result = vec![0.0; values.len()];
     for (y, out) in result.chunks_exact_mut(width).enumerate() {
-        for (tap, weight) in kernel.iter().enumerate() {
-            let from = (y + tap).saturating_sub(radius).min(height - 1) * width;
-            add_scaled(out, &rows[from..from + width], *weight);
-        }
+        weighted_sums(
+            out,
+            kernel,
+            #[inline(always)]
+            |tap| {
+                let from = (y + tap).saturating_sub(radius).min(height - 1) * width;
+                &rows[from..from + width]
+            },
+        );
     }
     result
 }
@@ -173,6 +194,28 @@ fn columns_then_rows(gradient: &[f32], width: usize, kernel: &[f32]) -> Vec<f32>
         result.extend_from_slice(&padded[radius..radius + width]);
     }
     result
+}
+
+/// The sums of values for each tap of a kernel, times its weights. Those of a whole vector stay in registers.
+#[inline(always)]
+fn weighted_sums<'a>(out: &mut [f32], kernel: &[f32], values: impl Fn(usize) -> &'a [f32]) {
+    const LANES: usize = 16;
+    let (vectors, rest) = out.as_chunks_mut::<LANES>();
+    let done = vectors.len();
+    for (index, out) in vectors.iter_mut().enumerate() {
+        let mut sums = [0.0; LANES];
+        for (tap, weight) in kernel.iter().enumerate() {
+            let values = &values(tap).as_chunks::<LANES>().0[index];
+            for lane in 0..LANES {
+                sums[lane] += weight * values[lane];
+            }
+        }
+        *out = sums;
+    }
+    rest.fill(0.0);
+    for (tap, weight) in kernel.iter().enumerate() {
+        add_scaled(rest, &values(tap)[done * LANES..], *weight);
+    }
 }
 
 #[inline(always)]

@@ -1,7 +1,7 @@
 //! The dense network, the paper's: a codec of single frames, an LSTM that encodes the context, and two LSTM decoders.
 //!
 //! Reading order: `lstm_cell` (weights and state) → `gates` (equations 1–5) → `recurrence` (all steps as one operation) →
-//! `lstm` (sequences) → `autoencoder` (the network). `layers` lists its tensors;
+//! `lstm` (sequences) → `autoencoder` (the network). `layers` lists its tensors; `packed_rollouts` predicts with packed weights;
 //! `plain` has the same in candle's own tensor operations.
 
 mod autoencoder;
@@ -10,6 +10,7 @@ mod layer_form;
 mod layers;
 mod lstm;
 mod lstm_cell;
+mod packed_rollouts;
 mod plain;
 mod recurrence;
 

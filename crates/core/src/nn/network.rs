@@ -136,6 +136,19 @@ impl Network {
         }
     }
 
+    /// Calls `read` with the values `[P]` of each frame of `codes`, in order, as [`Network::decode_frames`] gives them. Errors: `Shape`.
+    #[doc(hidden)]
+    pub fn for_each_frame(&self, codes: &[f32], mut read: impl FnMut(&[f32])) -> Result<(), NnError> {
+        let length = self.spec.code_len();
+        match &self.network {
+            AnyNetwork::Dense(dense) => dense.for_each_frame(codes, read),
+            AnyNetwork::Flow(_) | AnyNetwork::Sprites(_) => {
+                codes.chunks_exact(length).for_each(&mut read);
+                Ok(())
+            }
+        }
+    }
+
     /// Codes `[B, horizon, code_len]` of the frames that follow those with `codes` [B, context, `code_len`]. The feedback is
     /// the dense network's; the flow network reads no prediction of its own. Errors: `Shape`, `Missing`.
     pub fn predict(

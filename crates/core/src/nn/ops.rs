@@ -18,5 +18,5 @@ pub(super) mod pixel_shuffle;
 mod reduced;
 pub(super) mod row_weights;
 pub(super) mod sampling;
-mod scratch;
+pub(super) mod scratch;
 mod winograd;

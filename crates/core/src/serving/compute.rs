@@ -17,9 +17,6 @@ use crate::registry::Model;
 use crate::registry::calibration::{ContextStatistics, RolloutInContext};
 use crate::types::{Action, RobotState};
 
-/// How many frames are decoded together at most. This bounds the memory that many rollouts need.
-const DECODED_FRAMES: usize = 1024;
-
 /// Computes the tasks as one batch, without warnings and timing: one matrix product encodes all new frames, and one predicts all rollouts.
 /// Errors: `Model` if a task does not fit the model, `Frame`.
 pub(super) fn run(loaded: &Model, tasks: &[&Task]) -> Result<Vec<Prediction>, ServingError> {
@@ -178,17 +175,16 @@ impl<'a> Windows<'a> {
         };
         let network = &self.loaded.network;
         let codes = network.predict_steps(&self.features, &window_of, &conditioning, steps)?;
-        let codes = codes.flatten(0, 1)?;
-        let mut frames = decode(self.loaded, &codes, rows.len() * steps)?.into_iter();
-        Ok(with_values(&self.features, |seen| {
+        with_values(&self.features, |seen| {
             with_values(&codes, |codes| {
+                let mut frames = decode(self.loaded, codes)?.into_iter();
                 let codes = codes.chunks_exact(steps * spec.code_len());
                 let rollouts = rows.iter().zip(codes);
-                rollouts
-                    .map(|(row, codes)| self.rollout(*row, seen, codes, frames.by_ref().take(steps).collect()))
-                    .collect()
+                let rollouts =
+                    rollouts.map(|(row, codes)| self.rollout(*row, seen, codes, frames.by_ref().take(steps).collect()));
+                Ok::<_, Failure>(rollouts.collect())
             })
-        })??)
+        })??
     }
 
     /// What stands around the robot at the last frame of a window, and where movers will be while it stops; `None` if the model
@@ -281,23 +277,16 @@ impl<'a> Windows<'a> {
     }
 }
 
-/// The frames of `total` predicted codes.
-fn decode(loaded: &Model, codes: &Tensor, total: usize) -> Result<Vec<Frame>, Failure> {
+/// The frames of predicted codes.
+fn decode(loaded: &Model, codes: &[f32]) -> Result<Vec<Frame>, Failure> {
     let spec = loaded.spec();
     let (width, height) = (spec.frame_width_px, spec.frame_height_px);
-    let mut frames = Vec::with_capacity(total);
-    for first in (0..total).step_by(DECODED_FRAMES) {
-        let part = codes.narrow(0, first, DECODED_FRAMES.min(total - first))?;
-        let decoded = loaded.network.decode_frames(&part)?;
-        with_values(&decoded, |values| {
-            for pixels in values.chunks_exact(spec.pixels()) {
-                frames.push(spec.preprocess.frame_from(pixels, width, height)?);
-            }
-            Ok(())
-        })?
-        .map_err(Failure::Image)?;
-    }
-    Ok(frames)
+    let mut frames = Vec::with_capacity(codes.len() / spec.code_len());
+    loaded.network.for_each_frame(codes, |values| {
+        frames.push(spec.preprocess.frame_from(values, width, height));
+    })?;
+    let frames: Result<Vec<Frame>, FrameError> = frames.into_iter().collect();
+    frames.map_err(Failure::Image)
 }
 
 /// Actions `[N, steps, A]` and states `[N, S]` in physical units, if the model takes them; NaN where they are not known.

@@ -3,6 +3,7 @@
 //! which knows only data like those of the training, expects too little.
 
 use std::collections::VecDeque;
+use std::sync::Arc;
 
 use crate::frame::Frame;
 use crate::frame::difference::squared_difference_of_bytes;
@@ -54,8 +55,8 @@ impl PastError {
 pub(super) struct PastErrors {
     /// Of each predicted step.
     of_steps: Vec<PastError>,
-    /// The predictions from the last frames, the latest first; empty for a frame without one.
-    pending: VecDeque<Vec<PendingFrame>>,
+    /// The predictions from the last frames, the latest first; empty for a frame without one. Each task has all, so they are shared.
+    pending: VecDeque<Arc<[PendingFrame]>>,
 }
 
 /// A predicted frame that did not arrive yet.

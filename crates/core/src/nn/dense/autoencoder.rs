@@ -4,13 +4,21 @@ use candle_core::{Device, Tensor};
 
 use super::layer_form::LayerForm;
 use super::lstm_cell::{Decoder, DecoderInputs, LstmState, PeepholeCell};
+use super::packed_rollouts::{PackedInputs, PackedLayers};
 use crate::nn::conditioning::ConditioningTensors;
 use crate::nn::error::NnError;
 use crate::nn::model_tensors::ModelTensors;
 use crate::nn::ops::linear::Linear;
+use crate::nn::ops::scratch::with_buffers;
 use crate::nn::options::{PredictorOutput, Reconstruction};
 use crate::nn::precision::Precision;
 use crate::nn::spec::{DenseSpec, ModelSpec};
+use crate::nn::tensors::with_values;
+
+/// How many frames are decoded together at most. This bounds the memory that many rollouts need.
+const DECODED_FRAMES: usize = 1024;
+/// With packed weights; frames of 64×64 px then stay in the cache until they are read.
+const DECODED_FRAMES_IN_CACHE: usize = 32;
 
 /// What the predictor gets as the previous frame in each step.
 #[derive(Clone, Copy, Debug)]
@@ -95,6 +103,28 @@ impl DenseNetwork {
         Self::finished(self.layers.linear(&self.frame_decoder, &self.moved(features)?)?)
     }
 
+    /// Calls `read` with the values `[P]` of each frame, as [`DenseNetwork::decode_frames`] gives them.
+    pub(in crate::nn) fn for_each_frame(&self, features: &[f32], mut read: impl FnMut(&[f32])) -> Result<(), NnError> {
+        let (width, pixels) = (self.sizes.features, self.spec.pixels());
+        let Some(packed) = &self.frame_decoder.packed else {
+            for features in features.chunks(DECODED_FRAMES * width) {
+                let shape = (features.len() / width, width);
+                let frames = self.decode_frames(&Tensor::from_slice(features, shape, &Device::Cpu)?)?;
+                with_values(&frames, |frames| frames.chunks_exact(pixels).for_each(&mut read))?;
+            }
+            return Ok(());
+        };
+        let most = DECODED_FRAMES_IN_CACHE.min(features.len() / width);
+        with_buffers([most * pixels, 0, 0], |[frames, ..]| {
+            for features in features.chunks(DECODED_FRAMES_IN_CACHE * width) {
+                let frames = &mut frames[..features.len() / width * pixels];
+                packed.multiply_rows(features, frames);
+                frames.chunks_exact(pixels).for_each(&mut read);
+            }
+        });
+        Ok(())
+    }
+
     /// Predicts the features `[B, horizon, F]` of the frames that follow the context `features` `[B, context, F]`, from the
     /// true ones, `target` ("teacher forcing"). The predictor starts from the encoder's last state. Step k gets the features
     /// of frame k, the action that leads to frame k + 1, and the state; its output is added to the features unless the
@@ -131,12 +161,15 @@ impl DenseNetwork {
         windows: &[u32],
         condition: &ConditioningTensors,
     ) -> Result<Tensor, NnError> {
+        let conditions = self.conditions(condition, windows.len())?;
+        if let Some(layers) = self.packed_layers() {
+            return self.packed_rollouts(&layers, features, windows, conditions.as_ref());
+        }
         let features = &self.moved(features)?;
         let (_, LstmState { h, c }) = self.encode(features)?;
         let last = features.get_on_dim(1, self.spec.context - 1)?;
         let rows = Tensor::new(windows, features.device())?;
         let of_rollouts = |values: &Tensor| values.contiguous()?.index_select(&rows, 0);
-        let conditions = self.conditions(condition, windows.len())?;
         let decoder = Decoder {
             cell: &self.predictor,
             output: &self.predictor_output,
@@ -153,6 +186,48 @@ impl DenseNetwork {
             conditions: conditions.as_ref(),
         };
         Self::finished(self.layers.decode(&decoder, inputs, &state)?)
+    }
+
+    /// The layers that predict, if they are packed.
+    fn packed_layers(&self) -> Option<PackedLayers<'_>> {
+        Some(PackedLayers {
+            encoder: self.encoder.packed.as_deref()?,
+            predictor: self.predictor.packed.as_deref()?,
+            output: self.predictor_output.packed.as_deref()?,
+            residual: self.sizes.predictor_output == PredictorOutput::Residual,
+        })
+    }
+
+    fn packed_rollouts(
+        &self,
+        layers: &PackedLayers,
+        features: &Tensor,
+        windows: &[u32],
+        conditions: Option<&Tensor>,
+    ) -> Result<Tensor, NnError> {
+        let (batch, context, width) = features.dims3()?;
+        if let Some(window) = windows.iter().find(|&&window| window as usize >= batch) {
+            return Err(candle_core::Error::Msg(format!("there is no window {window} of {batch}")).into());
+        }
+        let shape = (windows.len(), self.spec.horizon, width);
+        let mut out = vec![0.0; windows.len() * self.spec.horizon * width];
+        let mut predict = |features: &[f32], conditions: &[f32]| {
+            let inputs = PackedInputs {
+                features,
+                context,
+                windows,
+                conditions,
+            };
+            layers.predict(&inputs, &mut out);
+        };
+        with_values(features, |features| match conditions {
+            Some(conditions) => with_values(conditions, |conditions| predict(features, conditions)),
+            None => {
+                predict(features, &[]);
+                Ok(())
+            }
+        })??;
+        Ok(Tensor::from_vec(out, shape, &Device::Cpu)?)
     }
 
     /// Reconstructs the features `[B, context, F]` from the encoder's output. Approach 1 (sequence): the decoder starts from

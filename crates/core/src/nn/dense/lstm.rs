@@ -7,7 +7,6 @@ use super::lstm_cell::{Decoder, DecoderInputs, LstmState, PeepholeCell};
 use super::recurrence::{FeedbackLoop, Recurrence};
 use crate::nn::error::NnError;
 use crate::nn::ops::linear::Linear;
-use crate::nn::tensors::with_values;
 
 /// Runs the cell over a sequence x `[B, T, D]` from `state`. Returns the outputs `[B, T, H]` and the last state.
 pub fn unroll(cell: &PeepholeCell, x: &Tensor, state: &LstmState) -> Result<(Tensor, LstmState), NnError> {
@@ -24,20 +23,6 @@ pub fn unroll(cell: &PeepholeCell, x: &Tensor, state: &LstmState) -> Result<(Ten
 /// steps, `[T · B, 4H]`.
 fn input_projection(cell: &PeepholeCell, x: &Tensor, first_row: usize) -> Result<Tensor, NnError> {
     let rows = x.transpose(0, 1)?.contiguous()?.flatten(0, 1)?;
-    // The packed rows of a decoder are those of its conditions; with teacher forcing, it needs those of all inputs.
-    if let Some(packed) = cell
-        .packed
-        .as_ref()
-        .filter(|packed| packed.fed_back.is_some() == (first_row > 0))
-    {
-        let count = rows.dim(0)?;
-        let sums = with_values(&rows, |rows| packed.projection.times(rows, count))?;
-        return Ok(Tensor::from_vec(
-            sums,
-            (count, packed.projection.outputs()),
-            x.device(),
-        )?);
-    }
     let layer = Linear {
         weight: cell.w_x.narrow(0, first_row, x.dim(2)?)?,
         bias: cell.bias.clone(),
@@ -66,12 +51,7 @@ impl Decoder<'_> {
         let feedback = FeedbackLoop {
             w_x: w_x.detach(),
             weight: output.weight.detach(),
-            packed: output.packed.clone(),
-            bias: match output.packed {
-                // Packed weights add it.
-                Some(_) => vec![0.0; output.bias.elem_count()],
-                None => output.bias.to_vec1()?,
-            },
+            bias: output.bias.to_vec1()?,
             residual,
         };
         let mut weights = cell.recurrent_weights();

@@ -42,6 +42,10 @@ pub(super) struct PackedCell {
     /// Of the other inputs, with the bias.
     pub(super) projection: RowWeights,
     pub(super) recurrent: RowWeights,
+    /// The bias alone `[4H]`.
+    pub(super) bias: Vec<f32>,
+    /// As in [`PeepholeCell`].
+    pub(super) peepholes: [Vec<f32>; 3],
 }
 
 impl PeepholeCell {
@@ -62,6 +66,7 @@ impl PeepholeCell {
         let (inputs, width) = self.w_x.dims2()?;
         let no_bias = vec![0.0; width];
         let bias = self.bias.to_vec1::<f32>()?;
+        let [i, f, o] = &self.peepholes;
         let of_rows = |first: usize, rows: usize, bias: &[f32]| {
             let rows = self.w_x.narrow(0, first, rows)?;
             with_values(&rows, |weights| RowWeights::new(weights, bias, precision))
@@ -70,6 +75,8 @@ impl PeepholeCell {
             fed_back: (fed_back > 0).then(|| of_rows(0, fed_back, &no_bias)).transpose()?,
             projection: of_rows(fed_back, inputs - fed_back, &bias)?,
             recurrent: with_values(&self.w_h, |weights| RowWeights::new(weights, &no_bias, precision))?,
+            peepholes: [i.to_vec1()?, f.to_vec1()?, o.to_vec1()?],
+            bias,
         };
         self.packed = Some(Arc::new(packed));
         Ok(())

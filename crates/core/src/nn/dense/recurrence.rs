@@ -30,7 +30,6 @@ impl Recurrence {
             w_h: cell.w_h.detach(),
             peepholes: [i.to_vec1()?, f.to_vec1()?, o.to_vec1()?],
             feedback,
-            packed: cell.packed.clone(),
             trace: OnceLock::new(),
         })
     }

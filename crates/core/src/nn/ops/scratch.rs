@@ -13,7 +13,7 @@ thread_local! {
 }
 
 /// Calls `run` with buffers of these lengths, whose contents are unspecified.
-pub(super) fn with_buffers<R>(lengths: [usize; BUFFERS], run: impl FnOnce([&mut [f32]; BUFFERS]) -> R) -> R {
+pub(in crate::nn) fn with_buffers<R>(lengths: [usize; BUFFERS], run: impl FnOnce([&mut [f32]; BUFFERS]) -> R) -> R {
     let mut kept = KEPT.take();
     let mut at = 0;
     let buffers = kept.each_mut().map(|buffer| {

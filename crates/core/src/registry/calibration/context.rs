@@ -4,16 +4,15 @@
 
 use std::f32::consts::SQRT_2;
 
-use candle_core::{Device, Tensor};
-
 use crate::frame::Frame;
 use crate::frame::difference::{squared_difference, squared_difference_of_bytes};
-use crate::nn::tensors::with_values;
 use crate::nn::{Network, NnError};
 use crate::vectorized::vectorized;
 
 /// Cosine waves along each side, the constant one included.
 const WAVES: usize = 4;
+/// Columns whose sums are computed together.
+const LANES: usize = 16;
 /// Distances in pixels over which neighbours are compared.
 const REACHES: [usize; 2] = [1, 4];
 /// Number of statistics of a frame's look: waves along both sides, and edges over each reach in both directions.
@@ -38,18 +37,25 @@ impl ContextStatistics {
     /// Of the last frame and the one before it: intensities 0…1, row by row.
     #[must_use]
     pub fn of(last: &[f32], before: &[f32], width: usize) -> Self {
+        let waves = Waves::new(width, last.len() / width.max(1));
+        Self::with(&waves, last, before)
+    }
+
+    fn with(waves: &Waves, last: &[f32], before: &[f32]) -> Self {
         let mut appearance = [0.0; APPEARANCE];
-        let (waves, edges) = appearance.split_at_mut(WAVES * WAVES);
-        write_waves(last, width, waves);
+        let (means, edges) = appearance.split_at_mut(WAVES * WAVES);
+        means.copy_from_slice(waves.means(last).as_flattened());
         for (out, reach) in edges.chunks_exact_mut(2).zip(REACHES) {
-            out.copy_from_slice(&log_differences(last, width, reach));
+            out.copy_from_slice(&log_differences(last, waves.width, reach));
         }
-        let unchanged = last
-            .iter()
-            .zip(before)
-            .filter(|(a, b)| (**a - **b).abs() < STILL)
-            .count();
-        let share = (unchanged as f64 / last.len().max(1) as f64).clamp(SHARE_MARGIN, 1.0 - SHARE_MARGIN);
+        let unchanged: u32 = vectorized(
+            #[inline(always)]
+            || {
+                let pairs = last.iter().zip(before);
+                pairs.map(|(a, b)| u32::from((a - b).abs() < STILL)).sum()
+            },
+        );
+        let share = (f64::from(unchanged) / last.len().max(1) as f64).clamp(SHARE_MARGIN, 1.0 - SHARE_MARGIN);
         Self {
             appearance,
             // The first reach is that of the next pixel.
@@ -63,61 +69,102 @@ impl ContextStatistics {
     #[doc(hidden)]
     pub fn of_codes(model: &Network, codes: &[f32], frames: usize) -> Result<Vec<Self>, NnError> {
         let (spec, length) = (model.spec(), model.spec().code_len());
+        // Of each window the frame before the last one, or the only one, and the last one.
         let mut ends = Vec::new();
         for window in codes.chunks_exact(frames * length) {
-            for back in [1, frames.min(2)] {
+            for back in [frames.min(2), 1] {
                 ends.extend_from_slice(&window[(frames - back) * length..][..length]);
             }
         }
-        let ends = Tensor::from_vec(ends, (2 * codes.len() / (frames * length), length), &Device::Cpu)?;
-        let (pixels, width) = (spec.pixels(), spec.frame_width_px as usize);
-        let decoded = model.decode_frames(&ends)?;
-        Ok(with_values(&decoded, |values| {
-            values
-                .chunks_exact(2 * pixels)
-                .map(|pair| {
-                    let camera = spec.preprocess.inverse(pair);
-                    let (last, before) = camera.split_at(pixels);
-                    Self::of(last, before, width)
-                })
-                .collect()
-        })?)
+        let waves = Waves::new(spec.frame_width_px as usize, spec.frame_height_px as usize);
+        let (mut found, mut before) = (Vec::new(), None);
+        model.for_each_frame(&ends, |values| {
+            let frame = spec.preprocess.inverse(values);
+            match before.take() {
+                None => before = Some(frame),
+                Some(before) => found.push(Self::with(&waves, &frame, &before)),
+            }
+        })?;
+        Ok(found)
     }
 }
 
-/// Mean of the image times each pair of cosine waves; the constant pair is the mean of the image.
-fn write_waves(image: &[f32], width: usize, out: &mut [f64]) {
-    let height = image.len() / width.max(1);
-    let table = |side: usize| -> Vec<[f32; WAVES]> {
-        let angle = |at: usize| std::f32::consts::PI * (at as f32 + 0.5) / side as f32;
-        // The cosines of multiples of an angle follow from its own.
-        let waves = |cosine: f32| {
-            let second = 2.0 * cosine * cosine - 1.0;
-            let third = cosine * (2.0 * second - 1.0);
-            [1.0, SQRT_2 * cosine, SQRT_2 * second, SQRT_2 * third]
-        };
-        (0..side).map(|at| waves(angle(at).cos())).collect()
-    };
-    let (across, down) = (table(width), table(height));
-    let mut columns = vec![0.0f32; width];
-    for (wave, out) in out.chunks_exact_mut(WAVES).enumerate() {
-        columns.fill(0.0);
+/// Cosine waves along both sides of images of one size.
+struct Waves {
+    width: usize,
+    /// Of some neighbouring columns each; 0 beyond the image.
+    across: Vec<[[f32; LANES]; WAVES]>,
+    /// Of each row.
+    down: Vec<[f32; WAVES]>,
+}
+
+impl Waves {
+    fn new(width: usize, height: usize) -> Self {
+        let mut across = vec![[[0.0; LANES]; WAVES]; width.div_ceil(LANES)];
+        for (column, waves) in waves(width).enumerate() {
+            for (wave, value) in waves.into_iter().enumerate() {
+                across[column / LANES][wave][column % LANES] = value;
+            }
+        }
+        Self {
+            width,
+            across,
+            down: waves(height).collect(),
+        }
+    }
+
+    /// Mean of the image times each pair of waves, down and across; the constant pair is the mean of the image.
+    fn means(&self, image: &[f32]) -> [[f64; WAVES]; WAVES] {
+        let mut sums = [[[0.0; LANES]; WAVES]; WAVES];
         vectorized(
             #[inline(always)]
             || {
-                for (row, down) in image.chunks_exact(width.max(1)).zip(&down) {
-                    for (sum, value) in columns.iter_mut().zip(row) {
-                        *sum += value * down[wave];
+                for (index, across) in self.across.iter().enumerate() {
+                    let columns = self.columns(image, index * LANES);
+                    for down in 0..WAVES {
+                        for other in 0..WAVES {
+                            for lane in 0..LANES {
+                                sums[down][other][lane] += columns[down][lane] * across[other][lane];
+                            }
+                        }
                     }
                 }
             },
         );
-        for (sum, across) in columns.iter().zip(&across) {
-            for (out, wave) in out.iter_mut().zip(across) {
-                *out += f64::from(sum * wave) / image.len() as f64;
+        let mean = |sums: [f32; LANES]| sums.into_iter().map(f64::from).sum::<f64>() / image.len().max(1) as f64;
+        sums.map(|sums| sums.map(mean))
+    }
+
+    /// The sums of the columns from one on, each row times its waves.
+    #[inline(always)]
+    fn columns(&self, image: &[f32], first: usize) -> [[f32; LANES]; WAVES] {
+        let mut columns = [[0.0; LANES]; WAVES];
+        for (row, down) in image.chunks_exact(self.width).zip(&self.down) {
+            let row = &row[first..];
+            let mut values = [0.0; LANES];
+            match row.first_chunk() {
+                Some(all) => values = *all,
+                None => values[..row.len()].copy_from_slice(row),
+            }
+            for wave in 0..WAVES {
+                for lane in 0..LANES {
+                    columns[wave][lane] += values[lane] * down[wave];
+                }
             }
         }
+        columns
     }
+}
+
+/// The waves at each place of a side of that length.
+fn waves(side: usize) -> impl Iterator<Item = [f32; WAVES]> {
+    (0..side).map(move |at| {
+        let cosine = (std::f32::consts::PI * (at as f32 + 0.5) / side as f32).cos();
+        // The cosines of multiples of an angle follow from its own.
+        let second = 2.0 * cosine * cosine - 1.0;
+        let third = cosine * (2.0 * second - 1.0);
+        [1.0, SQRT_2 * cosine, SQRT_2 * second, SQRT_2 * third]
+    })
 }
 
 /// Logarithms of the mean squared difference of pixels that are `reach` apart, across and down.

@@ -2,13 +2,11 @@
 // `pulp` compiles a closure with vector instructions; that includes only functions that are inlined into it.
 #![allow(clippy::inline_always)]
 
-use std::sync::{Arc, OnceLock};
+use std::sync::OnceLock;
 
 use candle_core::{Result, Tensor};
 
 use crate::nn::dense::gates;
-use crate::nn::dense::lstm_cell::PackedCell;
-use crate::nn::ops::row_weights::RowWeights;
 use crate::nn::tensors::{add_columns, rows_times};
 use crate::vectorized::vectorized;
 
@@ -18,9 +16,7 @@ pub(in crate::nn::dense) struct FeedbackLoop {
     pub(in crate::nn::dense) w_x: Tensor,
     /// Weights from the cell's output to the features `[H, F]`.
     pub(in crate::nn::dense) weight: Tensor,
-    /// The same, packed.
-    pub(in crate::nn::dense) packed: Option<Arc<RowWeights>>,
-    /// Bias of the features `[F]`; zeros if `packed` adds it.
+    /// Bias of the features `[F]`.
     pub(in crate::nn::dense) bias: Vec<f32>,
     /// Whether the layer's output is added to the previous features, instead of replacing them.
     pub(in crate::nn::dense) residual: bool,
@@ -45,7 +41,6 @@ pub(in crate::nn::dense) struct Recurrence {
     pub(super) w_h: Tensor,
     pub(super) peepholes: [Vec<f32>; 3],
     pub(super) feedback: Option<FeedbackLoop>,
-    pub(super) packed: Option<Arc<PackedCell>>,
     pub(super) trace: OnceLock<RecurrenceTrace>,
 }
 
@@ -67,13 +62,9 @@ impl Recurrence {
         for t in 0..self.steps {
             // A step's part of values with this many in a row.
             let range = |t: usize, size: usize| t * batch * size..(t + 1) * batch * size;
-            let (packed, h) = (self.packed.as_deref(), &trace.h[range(t, hidden)]);
-            let recurrent = times(packed.map(|packed| &packed.recurrent), h, batch, &self.w_h)?;
+            let recurrent = rows_times(&trace.h[range(t, hidden)], &self.w_h)?;
             let fed_back = match &self.feedback {
-                Some(feedback) => {
-                    let weights = packed.and_then(|packed| packed.fed_back.as_ref());
-                    times(weights, &trace.features[range(t, features)], batch, &feedback.w_x)?
-                }
+                Some(feedback) => rows_times(&trace.features[range(t, features)], &feedback.w_x)?,
                 None => Vec::new(),
             };
             let projection = if projection.len() == 4 * hidden {
@@ -83,8 +74,7 @@ impl Recurrence {
             };
             self.advance(&mut trace, t, [projection, &recurrent, &fed_back]);
             if let Some(feedback) = &self.feedback {
-                let h = &trace.h[range(t + 1, hidden)];
-                let change = times(feedback.packed.as_deref(), h, batch, &feedback.weight)?;
+                let change = rows_times(&trace.h[range(t + 1, hidden)], &feedback.weight)?;
                 feedback.advance(&mut trace.features[t * batch * features..], &change);
             }
         }
@@ -115,14 +105,6 @@ impl Recurrence {
                 }
             },
         );
-    }
-}
-
-/// The product of that many rows with packed weights, or else with the tensor.
-fn times(packed: Option<&RowWeights>, values: &[f32], rows: usize, tensor: &Tensor) -> Result<Vec<f32>> {
-    match packed {
-        Some(packed) => Ok(packed.times(values, rows)),
-        None => rows_times(values, tensor),
     }
 }
 

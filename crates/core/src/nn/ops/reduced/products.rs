@@ -7,7 +7,7 @@ use crate::nn::ops::packed::StartSums;
 
 /// A function that computes a product with instructions of its own. `places 8 then 4, vectors 1 2 3`: the sums of 8 places stay in
 /// registers while the inputs and weights pass by, for as many vectors of outputs as a panel has, which is 1, 2 or 3; what is left is
-/// computed for 4 places at once, then for each alone. The sums of a vector begin with what `start` gives, and `finish` turns them into
+/// computed for 4 places at once, then for two and for one. The sums of a vector begin with what `start` gives, and `finish` turns them into
 /// values. Where half of a panel's last vector has no outputs, `add_half` is taken, which may leave that half out.
 macro_rules! products {
     (
@@ -26,6 +26,10 @@ macro_rules! products {
                 while place + $fewer <= places {
                     block::<$fewer, VECTORS, HALF>(product, panel, place);
                     place += $fewer;
+                }
+                if place + 2 <= places {
+                    block::<2, VECTORS, HALF>(product, panel, place);
+                    place += 2;
                 }
                 while place < places {
                     block::<1, VECTORS, HALF>(product, panel, place);
