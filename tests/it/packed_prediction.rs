@@ -4,7 +4,7 @@ use std::path::Path;
 
 use candle_core::{Device, Tensor};
 use foreframe_core::nn::precision::Precision;
-use foreframe_core::nn::{ChannelScale, ConditioningTensors, ModelSpec, Network};
+use foreframe_core::nn::{ChannelScale, ConditioningTensors, ModelSpec, Network, NnError};
 use foreframe_core::registry;
 
 use crate::nn_fixtures::{largest_difference, values};
@@ -50,14 +50,31 @@ fn plans(spec: &ModelSpec, count: usize) -> ConditioningTensors {
     }
 }
 
+/// The frames of rollouts from two windows.
+fn predicted(network: &Network) -> Tensor {
+    let (spec, windows) = (network.spec(), [0, 1, 1, 0]);
+    let frames = frames(spec, 2).reshape((2 * spec.context, ())).unwrap();
+    let codes = network.encode_frames(&frames).unwrap();
+    let codes = codes.reshape((2, spec.context, ())).unwrap();
+    let plans = plans(spec, windows.len());
+    let ahead = network.predict_rollouts(&codes, &windows, &plans).unwrap();
+    network.decode_frames(&ahead.flatten(0, 1).unwrap()).unwrap()
+}
+
 #[test]
 fn packed_weights_predict_what_the_tensors_predict() {
-    for name in ["moving-flow", "rooms", "home", "static-flow"] {
+    for name in [
+        "static",
+        "paper",
+        "moving",
+        "moving-flow",
+        "rooms",
+        "home",
+        "static-flow",
+    ] {
         let (packed, on_tensors) = (packed(name), on_tensors(name));
-        let (spec, windows) = (packed.spec(), [0, 1, 1, 0]);
-        let (frames, plans) = (frames(spec, 2), plans(spec, windows.len()));
-        let [packed, expected] =
-            [&packed, &on_tensors].map(|network| network.predict_rollouts(&frames, &windows, &plans).unwrap());
+        let spec = packed.spec();
+        let [packed, expected] = [&packed, &on_tensors].map(predicted);
         let most = largest_difference(&packed, &expected);
         // Where depth is estimated, rounding moves a place, and so changes the depth found there; most in frames of noise, where `home` differs
         // by 6.4e-5.
@@ -70,32 +87,30 @@ fn packed_weights_predict_what_the_tensors_predict() {
 #[test]
 fn what_a_thread_predicted_before_changes_nothing() {
     let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
-    let networks = ["home", "static-flow", "moving-flow", "rooms"].map(packed);
-    let predicted = |network: &Network| {
-        let spec = network.spec();
-        let (frames, plans) = (frames(spec, 1), plans(spec, 1));
-        pool.install(|| network.predict_rollouts(&frames, &[0], &plans).unwrap())
-    };
-    let [alone, again] = [0, 1].map(|_| networks.iter().map(predicted).collect::<Vec<_>>());
+    let networks = ["home", "static-flow", "moving-flow", "static", "rooms", "moving"].map(packed);
+    let [alone, again] = [0, 1].map(|_| {
+        let predicted = networks.iter().map(|network| pool.install(|| predicted(network)));
+        predicted.collect::<Vec<_>>()
+    });
     for (alone, again) in alone.iter().zip(&again) {
         assert_eq!(largest_difference(alone, again), 0.0);
     }
 }
 
 #[test]
+fn a_rollout_of_no_window_is_an_error() {
+    for network in ["static", "moving"].map(packed) {
+        let spec = network.spec();
+        let codes = values(&[2, spec.context, spec.code_len()], 0.5);
+        let found = network.predict_rollouts(&codes, &[0, 2], &plans(spec, 2));
+        assert!(matches!(found, Err(NnError::Tensor(_))), "{found:?}");
+    }
+}
+
+#[test]
 fn fewer_bits_predict_nearly_the_same() {
     for name in ["static", "moving", "moving-flow", "rooms", "home", "static-flow"] {
-        let on_tensors = on_tensors(name);
-        let (spec, windows) = (on_tensors.spec(), [0, 1, 1, 0]);
-        let (frames, plans) = (frames(spec, 2), plans(spec, windows.len()));
-        let frames = frames.reshape((2 * spec.context, ())).unwrap();
-        let predicted = |network: &Network| {
-            let codes = network.encode_frames(&frames).unwrap();
-            let codes = codes.reshape((2, spec.context, ())).unwrap();
-            let ahead = network.predict_rollouts(&codes, &windows, &plans).unwrap();
-            network.decode_frames(&ahead.flatten(0, 1).unwrap()).unwrap()
-        };
-        let expected = predicted(&on_tensors);
+        let expected = predicted(&on_tensors(name));
         for (precision, bound) in [(Precision::Bf16, 3e-3), (Precision::Int8, 1e-2)] {
             if !precision.is_supported() {
                 eprintln!("skipped: this processor does not multiply {precision}");
@@ -111,7 +126,9 @@ fn fewer_bits_predict_nearly_the_same() {
 
 #[test]
 fn many_plans_give_the_bits_that_each_alone_gives() {
-    let networks = ["moving-flow", "rooms", "home"].map(packed).into_iter();
+    let networks = ["moving-flow", "rooms", "home", "moving", "static"]
+        .map(packed)
+        .into_iter();
     let in_fewer_bits = [Precision::Bf16, Precision::Int8]
         .into_iter()
         .filter(|precision| precision.is_supported());

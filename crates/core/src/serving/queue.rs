@@ -160,8 +160,9 @@ impl QueueState {
             if choice.batch.binary_search(&position).is_ok() {
                 batch.push(waiting);
             } else if choice.discard.binary_search(&position).is_ok() {
-                let is_abandoned = waiting.reply.is_closed();
-                meter::record_refusal(if is_abandoned { "abandoned" } else { "deadline" });
+                // Who waits gives up at the deadline too, and before it only if the client is gone.
+                let is_late = waiting.deadline <= now;
+                meter::record_refusal(if is_late { "deadline" } else { "abandoned" });
             } else {
                 remaining.push_back(waiting);
             }

@@ -71,9 +71,9 @@ impl DenseNetwork {
         }
     }
 
-    /// Packs what a prediction needs in this precision; in single precision, and on another device, it stays as it is.
+    /// Packs what a prediction needs in this precision; on another device, it stays as it is.
     pub(in crate::nn) fn pack(&mut self, precision: Precision) -> Result<(), NnError> {
-        if precision == Precision::F32 || self.layers == LayerForm::Plain {
+        if self.layers == LayerForm::Plain {
             return Ok(());
         }
         // The pictures of a standing camera differ little: with 8 bits here, `static` loses 0.03 of skill.
