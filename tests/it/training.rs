@@ -87,6 +87,11 @@ fn settings_that_do_not_fit_the_network_or_the_camera_are_refused() {
         ),
         (
             "moving-flow",
+            "pretrain.start=principal",
+            "pretrain.start is for the dense network only; it must be random where model.architecture is flow",
+        ),
+        (
+            "moving-flow",
             "sequence.feedback=teacher-forcing",
             "sequence.feedback is for the dense network only; it must be prediction where model.architecture is flow",
         ),

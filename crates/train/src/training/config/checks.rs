@@ -1,6 +1,6 @@
 //! The ranges of all settings of a training, and which settings others must allow.
 
-use super::{Mirror, TrainConfig, TrainingFeedback, WindowBudget};
+use super::{CodecStart, Mirror, TrainConfig, TrainingFeedback, WindowBudget};
 use crate::training::TrainError;
 use crate::training::optimizer::UpdateRule;
 use foreframe_core::nn::{ArchitectureKind, Conditioning};
@@ -89,11 +89,14 @@ impl TrainConfig {
         let uses_muon = run.optimizer == UpdateRule::Muon && architecture == ArchitectureKind::Dense;
         let is_forced =
             sequence.feedback == TrainingFeedback::TeacherForcing && architecture != ArchitectureKind::Dense;
+        let starts_from_components =
+            self.pretrain.start == CodecStart::Principal && architecture != ArchitectureKind::Dense;
         let counts_few = sequence.short_share > 0.0 && architecture != ArchitectureKind::Flow;
         let of_flow = [sequence.scene_weight, sequence.movers_weight, sequence.speeds_weight];
         let [scene, movers, speeds] = of_flow.map(|weight| weight > 0.0 && architecture == ArchitectureKind::Sprites);
         let of_others = [
             ("run.optimizer", uses_muon, "the flow and sprite networks", "adam"),
+            ("pretrain.start", starts_from_components, "the dense network", "random"),
             ("sequence.feedback", is_forced, "the dense network", "prediction"),
             ("sequence.short_share", counts_few, "the flow network", "0"),
             ("sequence.scene_weight", scene, "the flow network", "0"),

@@ -166,7 +166,10 @@ mod tests {
             (dense["hidden"].as_integer(), dense.contains_key("flow")),
             (Some(32), false)
         );
-        let flow = model_settings("moving", &["model.architecture=flow", "pretrain.steps=0"]);
+        let flow = model_settings(
+            "moving",
+            &["model.architecture=flow", "pretrain.steps=0", "pretrain.start=random"],
+        );
         assert_eq!(flow["flow"]["channels"].as_integer(), Some(48));
     }
 
