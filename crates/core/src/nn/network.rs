@@ -136,9 +136,8 @@ impl Network {
         }
     }
 
-    /// Calls `read` with the values `[P]` of each frame of `codes`, in order, as [`Network::decode_frames`] gives them. Errors: `Shape`.
-    #[doc(hidden)]
-    pub fn for_each_frame(&self, codes: &[f32], mut read: impl FnMut(&[f32])) -> Result<(), NnError> {
+    /// Calls `read` with the values `[P]` of each frame of these whole codes, in order, as [`Network::decode_frames`] gives them.
+    pub(crate) fn for_each_frame(&self, codes: &[f32], mut read: impl FnMut(&[f32])) -> Result<(), NnError> {
         let length = self.spec.code_len();
         match &self.network {
             AnyNetwork::Dense(dense) => dense.for_each_frame(codes, read),

@@ -13,7 +13,7 @@ pub struct Candidate {
     pub rows: usize,
     /// How many rollouts of its model are computed together at most.
     pub row_limit: usize,
-    /// Whether its client has disconnected.
+    /// Whether nobody waits for its answer any more.
     pub abandoned: bool,
     /// After this time nobody needs the answer.
     pub deadline: Instant,

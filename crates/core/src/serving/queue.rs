@@ -28,6 +28,13 @@ pub(super) struct QueuedTask {
     pub(super) reply: oneshot::Sender<Result<Prediction, ServingError>>,
 }
 
+impl QueuedTask {
+    /// Counts a task that is not computed. Who waits gives up at the deadline too, and before it only if the client is gone.
+    fn record_refusal(&self, now: Instant) {
+        meter::record_refusal(if self.deadline <= now { "deadline" } else { "abandoned" });
+    }
+}
+
 /// A model to load.
 pub(super) struct ModelLoad {
     pub(super) model: Model,
@@ -72,7 +79,14 @@ impl Queue {
         }
         if state.waiting.len() >= self.capacity {
             // Disconnected clients do not occupy the queue.
-            state.waiting.retain(|waiting| !waiting.reply.is_closed());
+            let now = Instant::now();
+            state.waiting.retain(|waiting| {
+                let is_wanted = !waiting.reply.is_closed();
+                if !is_wanted {
+                    waiting.record_refusal(now);
+                }
+                is_wanted
+            });
         }
         if state.waiting.len() >= self.capacity {
             meter::record_refusal("full");
@@ -160,9 +174,7 @@ impl QueueState {
             if choice.batch.binary_search(&position).is_ok() {
                 batch.push(waiting);
             } else if choice.discard.binary_search(&position).is_ok() {
-                // Who waits gives up at the deadline too, and before it only if the client is gone.
-                let is_late = waiting.deadline <= now;
-                meter::record_refusal(if is_late { "deadline" } else { "abandoned" });
+                waiting.record_refusal(now);
             } else {
                 remaining.push_back(waiting);
             }

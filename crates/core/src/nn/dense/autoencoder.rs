@@ -1,6 +1,6 @@
 //! The dense network: encodes frames to features and decodes them, predicts the next frames, reconstructs the context.
 
-use candle_core::{Device, Tensor};
+use candle_core::{DType, Device, Tensor};
 
 use super::layer_form::LayerForm;
 use super::lstm_cell::{Decoder, DecoderInputs, LstmState, PeepholeCell};
@@ -210,6 +210,9 @@ impl DenseNetwork {
             return Err(candle_core::Error::Msg(format!("there is no window {window} of {batch}")).into());
         }
         let shape = (windows.len(), self.spec.horizon, width);
+        if windows.is_empty() {
+            return Ok(Tensor::zeros(shape, DType::F32, &Device::Cpu)?);
+        }
         let mut out = vec![0.0; windows.len() * self.spec.horizon * width];
         let mut predict = |features: &[f32], conditions: &[f32]| {
             let inputs = PackedInputs {
@@ -217,6 +220,7 @@ impl DenseNetwork {
                 context,
                 windows,
                 conditions,
+                steps: self.spec.horizon,
             };
             layers.predict(&inputs, &mut out);
         };

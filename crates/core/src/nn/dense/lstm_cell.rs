@@ -30,7 +30,7 @@ pub struct PeepholeCell {
     pub(super) bias: Tensor,
     /// Diagonals of `W_ci`, `W_cf` and `W_co`, `[H]` each.
     pub(super) peepholes: [Tensor; 3],
-    /// For prediction in another than single precision.
+    /// For prediction; `None` in training.
     pub(super) packed: Option<Arc<PackedCell>>,
 }
 

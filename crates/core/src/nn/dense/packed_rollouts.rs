@@ -29,9 +29,13 @@ pub(super) struct PackedInputs<'a> {
     pub(super) windows: &'a [u32],
     /// What each step gets beside the features `[N, steps, A + S]`; empty if nothing.
     pub(super) conditions: &'a [f32],
+    pub(super) steps: usize,
 }
 
-/// What a thread keeps from one prediction to the next: new buffers would have to be filled with zeros.
+/// Values of the largest buffer that a thread keeps, 16 MiB.
+const MOST_VALUES: usize = 1 << 22;
+
+/// What a thread keeps from one prediction to the next: new buffers would be filled with zeros as a whole, these only where they grow.
 #[derive(Default)]
 struct Buffers {
     encoder: CellBuffers,
@@ -65,9 +69,12 @@ impl PackedLayers<'_> {
     pub(super) fn predict(&self, inputs: &PackedInputs, out: &mut [f32]) {
         let mut buffers = KEPT.take();
         self.read(inputs, &mut buffers.encoder);
-        self.begin(inputs, out.len() / inputs.windows.len(), &mut buffers);
-        self.decode(out, &mut buffers);
-        KEPT.set(buffers);
+        self.begin(inputs, &mut buffers);
+        self.decode(out, inputs.steps, &mut buffers);
+        let Buffers { encoder, predictor, .. } = &buffers;
+        if encoder.projection.len().max(predictor.projection.len()) <= MOST_VALUES {
+            KEPT.set(buffers);
+        }
     }
 
     /// The encoder's state after the context.
@@ -80,23 +87,27 @@ impl PackedLayers<'_> {
             .projection
             .multiply_rows(inputs.features, &mut buffers.projection);
         for step in 0..inputs.context {
-            // It begins with zeros, which add nothing.
-            let is_first = step == 0;
-            self.encoder.advance(buffers, (step, inputs.context), is_first, &[]);
+            let step = Step {
+                index: step,
+                of: inputs.context,
+                // They add nothing.
+                starts_from_zeros: step == 0,
+            };
+            self.encoder.advance(buffers, step, &[]);
         }
     }
 
-    /// The state of each rollout before its first step: that of its window. A rollout has so many features.
-    fn begin(&self, inputs: &PackedInputs, features: usize, buffers: &mut Buffers) {
+    /// The state of each rollout before its first step: that of its window.
+    fn begin(&self, inputs: &PackedInputs, buffers: &mut Buffers) {
         let (hidden, width) = (self.predictor.hidden(), self.output.outputs());
-        let (rollouts, steps) = (inputs.windows.len(), features / width);
+        let rollouts = inputs.windows.len();
         let Buffers {
             encoder,
             predictor,
             last,
             ..
         } = buffers;
-        predictor.resize(rollouts, steps, hidden);
+        predictor.resize(rollouts, inputs.steps, hidden);
         last.resize(rollouts * width, 0.0);
         // The last values of each window.
         let copy = |to: &mut [f32], from: &[f32], count: usize, step: usize| {
@@ -118,7 +129,8 @@ impl PackedLayers<'_> {
         }
     }
 
-    fn decode(&self, out: &mut [f32], buffers: &mut Buffers) {
+    /// Writes the features of each step.
+    fn decode(&self, out: &mut [f32], steps: usize, buffers: &mut Buffers) {
         let Buffers {
             predictor,
             last,
@@ -127,14 +139,19 @@ impl PackedLayers<'_> {
             ..
         } = buffers;
         let width = self.output.outputs();
-        let (rollouts, steps) = (last.len() / width, out.len() / last.len());
+        let rollouts = last.len() / width;
         change.resize(last.len(), 0.0);
         fed_back.resize(rollouts * 4 * self.predictor.hidden(), 0.0);
         for step in 0..steps {
             if let Some(weights) = &self.predictor.fed_back {
                 weights.multiply_rows(last, fed_back);
             }
-            self.predictor.advance(predictor, (step, steps), false, fed_back);
+            let of_step = Step {
+                index: step,
+                of: steps,
+                starts_from_zeros: false,
+            };
+            self.predictor.advance(predictor, of_step, fed_back);
             self.output.multiply_rows(&predictor.h, change);
             if self.residual {
                 add_columns(last, change);
@@ -159,19 +176,22 @@ impl CellBuffers {
     }
 }
 
+/// A step of a sequence.
+struct Step {
+    index: usize,
+    /// The steps of the sequence.
+    of: usize,
+    /// Whether `h` is zero before it.
+    starts_from_zeros: bool,
+}
+
 impl PackedCell {
     fn hidden(&self) -> usize {
         self.bias.len() / 4
     }
 
-    /// Computes a step of so many for all rows. `fed_back` is added to the sums, unless it is empty.
-    fn advance(
-        &self,
-        buffers: &mut CellBuffers,
-        (step, steps): (usize, usize),
-        starts_from_zeros: bool,
-        fed_back: &[f32],
-    ) {
+    /// Computes one step of all rows. `fed_back` is added to the sums, unless it is empty.
+    fn advance(&self, buffers: &mut CellBuffers, step: Step, fed_back: &[f32]) {
         let hidden = self.hidden();
         let CellBuffers {
             h,
@@ -181,7 +201,7 @@ impl PackedCell {
             recurrent,
         } = buffers;
         let mut others = [&[][..], fed_back];
-        if !starts_from_zeros {
+        if !step.starts_from_zeros {
             self.recurrent.multiply_rows(h, recurrent);
             others[0] = recurrent;
         }
@@ -189,7 +209,7 @@ impl PackedCell {
         vectorized(
             #[inline(always)]
             || {
-                let rows = projection[step * 4 * hidden..].chunks_mut(steps * 4 * hidden);
+                let rows = projection[step.index * 4 * hidden..].chunks_mut(step.of * 4 * hidden);
                 let states = h.chunks_exact_mut(hidden).zip(c.chunks_exact(hidden));
                 let states = states.zip(next_c.chunks_exact_mut(hidden));
                 for (row, (sums, ((h, c), next_c))) in rows.zip(states).enumerate() {
