@@ -80,7 +80,7 @@ impl Preprocess {
 
     /// The intensity of the camera that a value of the model stands for, 0…1.
     #[inline(always)]
-    fn intensity(&self, value: f32) -> f32 {
+    fn intensity(self, value: f32) -> f32 {
         let value = value.clamp(0.0, 1.0);
         if self.invert { 1.0 - value } else { value }
     }

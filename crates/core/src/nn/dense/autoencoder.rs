@@ -224,12 +224,12 @@ impl DenseNetwork {
             };
             layers.predict(&inputs, &mut out);
         };
-        with_values(features, |features| match conditions {
-            Some(conditions) => with_values(conditions, |conditions| predict(features, conditions)),
-            None => {
-                predict(features, &[]);
-                Ok(())
+        with_values(features, |features| {
+            if let Some(conditions) = conditions {
+                return with_values(conditions, |conditions| predict(features, conditions));
             }
+            predict(features, &[]);
+            Ok(())
         })??;
         Ok(Tensor::from_vec(out, shape, &Device::Cpu)?)
     }

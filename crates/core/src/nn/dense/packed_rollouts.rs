@@ -177,6 +177,7 @@ impl CellBuffers {
 }
 
 /// A step of a sequence.
+#[derive(Clone, Copy)]
 struct Step {
     index: usize,
     /// The steps of the sequence.
