@@ -82,15 +82,14 @@ impl TrainConfig {
         self.validate_together()
     }
 
-    /// Checks the settings that others must allow. Errors: `Config` with the first that does not fit, and what would.
-    fn validate_together(&self) -> Result<(), TrainError> {
+    /// Checks the settings that are for some networks only. Errors: `Config` with the first that does not fit, and what would.
+    fn validate_for_network(&self) -> Result<(), TrainError> {
         let (run, sequence) = (&self.run, &self.sequence);
         let architecture = self.model.architecture.kind();
-        let uses_muon = run.optimizer == UpdateRule::Muon && architecture == ArchitectureKind::Dense;
-        let is_forced =
-            sequence.feedback == TrainingFeedback::TeacherForcing && architecture != ArchitectureKind::Dense;
-        let starts_from_components =
-            self.pretrain.start == CodecStart::Principal && architecture != ArchitectureKind::Dense;
+        let is_dense = architecture == ArchitectureKind::Dense;
+        let uses_muon = run.optimizer == UpdateRule::Muon && is_dense;
+        let starts_from_components = self.pretrain.start == CodecStart::Principal && !is_dense;
+        let is_forced = sequence.feedback == TrainingFeedback::TeacherForcing && !is_dense;
         let counts_few = sequence.short_share > 0.0 && architecture != ArchitectureKind::Flow;
         let of_flow = [sequence.scene_weight, sequence.movers_weight, sequence.speeds_weight];
         let [scene, movers, speeds] = of_flow.map(|weight| weight > 0.0 && architecture == ArchitectureKind::Sprites);
@@ -115,12 +114,19 @@ impl TrainConfig {
                     .to_owned(),
             );
         }
-        if architecture != ArchitectureKind::Dense && self.pretrain.steps > 0 {
+        if !is_dense && self.pretrain.steps > 0 {
             return refused(format!(
                 "pretrain.steps is {}; only the dense network has pre-training, so it must be 0",
                 self.pretrain.steps
             ));
         }
+        Ok(())
+    }
+
+    /// Checks the settings that others must allow. Errors: `Config` with the first that does not fit, and what would.
+    fn validate_together(&self) -> Result<(), TrainError> {
+        self.validate_for_network()?;
+        let sequence = &self.sequence;
         if self.data.mirror == Mirror::Movers && self.model.conditioning != Conditioning::None {
             return refused(format!(
                 "data.mirror is \"movers\", which is for a camera that stands and takes no actions and no state; \
