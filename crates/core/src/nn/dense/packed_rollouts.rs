@@ -1,4 +1,4 @@
-//! Rollouts with packed weights: the steps of `lstm` and `recurrence`, in buffers that stay, without what a backward pass needs.
+//! Rollouts with packed weights: the steps of `lstm` and `recurrence`, in buffers that are reused, without what a backward pass needs.
 // `pulp` compiles a closure with vector instructions; that includes only functions that are inlined into it.
 #![allow(clippy::inline_always)]
 
@@ -143,15 +143,17 @@ impl PackedLayers<'_> {
         change.resize(last.len(), 0.0);
         fed_back.resize(rollouts * 4 * self.predictor.hidden(), 0.0);
         for step in 0..steps {
+            let mut added = &[][..];
             if let Some(weights) = &self.predictor.fed_back {
                 weights.multiply_rows(last, fed_back);
+                added = fed_back;
             }
             let of_step = Step {
                 index: step,
                 of: steps,
                 starts_from_zeros: false,
             };
-            self.predictor.advance(predictor, of_step, fed_back);
+            self.predictor.advance(predictor, of_step, added);
             self.output.multiply_rows(&predictor.h, change);
             if self.residual {
                 add_columns(last, change);
