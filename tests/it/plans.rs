@@ -201,8 +201,12 @@ fn slow(dir: &std::path::Path) -> Model {
 #[tokio::test]
 async fn the_budget_is_kept_and_the_answer_is_to_stop_if_nothing_was_judged() {
     let dir = tempfile::tempdir().unwrap();
-    let app = start(with_data(dir.path(), ServerConfig::default()), vec![slow(dir.path())]);
-    // Another client's rollouts are being predicted, so nothing comes back in time.
+    let config = ServerConfig {
+        max_batch: 2048,
+        ..ServerConfig::default()
+    };
+    let app = start(with_data(dir.path(), config), vec![slow(dir.path())]);
+    // Another client's rollouts are being predicted, all together, so nothing comes back in time.
     let plans: Vec<Value> = (0..500).map(|_| json!([[0.1, 0.1], [0.1, 0.1]])).collect();
     let many = json!({"frames": context(), "state": [0.5], "plans": plans});
     let busy = post(&app, "/v1/models/slow/rollouts", &many);
