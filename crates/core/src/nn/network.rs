@@ -84,8 +84,8 @@ impl Network {
 
     /// The same network with its weights packed as they are now, for faster predictions; it sees no update of the parameters.
     /// In single precision, predictions differ by less than 1e-5 of full scale, by less than 1e-4 where depth is estimated, at sharp edges. How
-    /// far the other precisions differ, docs/experiments.md says. What is predicted together has the bits of each alone. Errors: `Precision`
-    /// if this processor does not multiply such numbers, `Tensor`.
+    /// far the other precisions differ, docs/experiments.md says. On the processor, what is predicted together has the bits of each alone.
+    /// Errors: `Precision` if this processor does not multiply such numbers, `Tensor`.
     pub fn packed(mut self, precision: Precision) -> Result<Self, NnError> {
         precision.check_support()?;
         match &mut self.network {

@@ -85,7 +85,7 @@ fn predict(session: &mut Session, message: &FrameMessage) -> Option<Vec<Frame>> 
 }
 
 /// Whether predicted images are those of the library.
-pub(super) fn are_equal<'a>(found: impl ExactSizeIterator<Item = &'a [u8]>, expected: &[Frame]) -> bool {
+pub(super) fn are_equal<'a>(found: impl Iterator<Item = &'a [u8]>, expected: &[Frame]) -> bool {
     found.eq(expected.iter().map(Frame::pixels))
 }
 
