@@ -19,4 +19,5 @@ mod reduced;
 pub(super) mod row_weights;
 pub(super) mod sampling;
 pub(super) mod scratch;
+pub(super) mod waves;
 mod winograd;

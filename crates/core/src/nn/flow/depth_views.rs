@@ -11,7 +11,8 @@ use rayon::prelude::*;
 
 use super::encoder_views::EncoderViews;
 use crate::frame::warp::CameraModel;
-use crate::nn::geometry::camera::{Viewer, ViewerRays, rotated};
+use crate::nn::geometry::camera::{Viewer, rotated};
+use crate::nn::geometry::viewer_rays::ViewerRays;
 use crate::nn::ops::gathering::{OfPlaces, SAMPLED_TOGETHER, read_together, write_together};
 use crate::nn::ops::sampling::{ImageSize, SampledImage, centred};
 use crate::vectorized::vectorized_by;
@@ -67,7 +68,7 @@ impl DepthViews {
         for index in 0..contexts.count() {
             let camera = contexts.cameras[index].unwrap_or(CameraModel::USUAL);
             let height_m = camera.height_m.unwrap_or(CameraModel::USUAL_HEIGHT_M);
-            let camera = ViewerRays::from(Viewer::new(camera, size));
+            let camera = ViewerRays::of(Viewer::new(camera, size));
             let depths = depths_before_learning(&camera.rays, height_m);
             let frame = &mut views.frames[index * pixels..(index + 1) * pixels];
             let levels = levels(frame);
@@ -330,7 +331,7 @@ mod tests {
 
     #[test]
     fn a_frame_seen_from_the_same_place_stays() {
-        let camera = ViewerRays::from(Viewer::new(CameraModel::new(1.0, 0.3).unwrap(), SIZE));
+        let camera = ViewerRays::of(Viewer::new(CameraModel::new(1.0, 0.3).unwrap(), SIZE));
         let frame: Vec<f32> = (0..64).map(|pixel| pixel as f32).collect();
         let depths = depths_before_learning(&camera.rays, 0.5);
         let (moved, shifts) = moved_back(&camera, SIZE, &depths, [0.0; 3], [&[0.0; 64], &frame]);
@@ -341,7 +342,7 @@ mod tests {
     #[test]
     fn a_moved_camera_gives_the_bits_of_each_pixel_alone() {
         let size = ImageSize { height: 8, width: 20 };
-        let camera = ViewerRays::from(Viewer::new(CameraModel::new(1.0, 0.3).unwrap(), size));
+        let camera = ViewerRays::of(Viewer::new(CameraModel::new(1.0, 0.3).unwrap(), size));
         let depths = depths_before_learning(&camera.rays, 0.5);
         let [last, earlier] = [3, 7].map(|step| (0..160).map(|pixel| (pixel * step % 11) as f32).collect::<Vec<f32>>());
         let [yaw, ahead, left] = [-0.15, -0.2, 0.05];

@@ -8,7 +8,8 @@ use super::rollout_rows::RolloutRows;
 use super::scene::Scene;
 use super::steps_ahead::{PredictedAhead, StepsAhead};
 use crate::nn::error::NnError;
-use crate::nn::geometry::camera::{CameraPose, Viewer, turning_places};
+use crate::nn::geometry::camera::{CameraPose, Viewer};
+use crate::nn::geometry::turning::{turned, turning_places};
 use crate::nn::ops::compose::{Composition, RoomPlaces, SCENE_FEATURES};
 use crate::nn::ops::joining::joined;
 use crate::nn::ops::linear::per_place;
@@ -98,7 +99,7 @@ impl FlowNetwork {
         let yaw = motion.narrow(1, 0, 1)?.flatten_all()?;
         Ok(ItemPlaces {
             turned: turning_places(viewer, &yaw)?,
-            coarse: with_values(&yaw, |yaw| Viewer::new(camera, size.shrunk(4)).turned(yaw))?,
+            coarse: with_values(&yaw, |yaw| turned(Viewer::new(camera, size.shrunk(4)), yaw))?,
             room: scene.room_places(viewer, poses, before)?,
         })
     }

@@ -4,6 +4,7 @@ use super::blocks::write_blocks;
 use crate::frame::warp::CameraModel;
 use crate::nn::geometry::camera::{CameraPose, Viewer};
 use crate::nn::geometry::state_channels::StateChannels;
+use crate::nn::geometry::turning::turned;
 use crate::nn::ops::sampling::{PixelPlaces, centred, own_places};
 use crate::nn::spec::ModelSpec;
 
@@ -56,11 +57,11 @@ impl EncoderViews<'_> {
             );
             for back in 1..frames_read {
                 let frame = &self.earlier[(index * (frames_read - 1) + back - 1) * pixels..][..pixels];
-                let turned = yaw_rate.zip(camera).map(|(rate, camera)| {
+                let before = yaw_rate.zip(camera).map(|(rate, camera)| {
                     let yaw = rate * self.spec.frame_period_s as f32 * back as f32;
-                    Viewer::new(camera, size).turned(&[yaw])
+                    turned(Viewer::new(camera, size), &[yaw])
                 });
-                let places = PixelPlaces::Pairs(turned.as_ref().unwrap_or(&own));
+                let places = PixelPlaces::Pairs(before.as_ref().unwrap_or(&own));
                 write_blocks(frame, size, places, inputs, 4 * back);
             }
             let seen = &seen[index * half.pixels() * 4..(index + 1) * half.pixels() * 4];

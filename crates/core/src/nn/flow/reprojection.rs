@@ -9,7 +9,8 @@ use candle_core::{Result, Shape, Tensor, bail};
 
 use crate::frame::warp::MIN_DEPTH;
 use crate::nn::fused::{FusedOperation, Operand, apply};
-use crate::nn::geometry::camera::{Viewer, ViewerRays, rotated};
+use crate::nn::geometry::camera::{Viewer, rotated};
+use crate::nn::geometry::viewer_rays::ViewerRays;
 use crate::nn::ops::gathering::{OfPlaces, SAMPLED_TOGETHER, write_together};
 use crate::nn::ops::sampling::{ImageSize, Neighbourhood, SampledImage};
 use crate::nn::recycled::buffer;
@@ -282,7 +283,9 @@ mod tests {
         let camera = |fov: f32| CameraModel::new(fov, 0.2).unwrap();
         Reprojection {
             size: SIZE,
-            cameras: [1.0, 1.3].map(|fov| Viewer::new(camera(fov), SIZE).into()).to_vec(),
+            cameras: [1.0, 1.3]
+                .map(|fov| ViewerRays::of(Viewer::new(camera(fov), SIZE)))
+                .to_vec(),
             context_of: vec![0, 1, 1],
         }
     }
@@ -296,7 +299,7 @@ mod tests {
     fn a_camera_that_drives_to_a_wall_saw_it_smaller() {
         let motions = Tensor::new(&[[0.0f32, 0.5, 0.0]; 3], &Device::Cpu).unwrap();
         let flat = Reprojection {
-            cameras: vec![Viewer::new(CameraModel::new(1.0, 0.0).unwrap(), SIZE).into(); 2],
+            cameras: vec![ViewerRays::of(Viewer::new(CameraModel::new(1.0, 0.0).unwrap(), SIZE)); 2],
             ..reprojection()
         };
         let places = reproject(flat, &wall(3.0), &motions).unwrap();

@@ -8,8 +8,9 @@ use candle_core::{DType, Device, Tensor};
 
 use super::blocks::content_blocks;
 use super::encoder_views::EncoderViews;
+use super::ray_description::RAY_VALUES;
 use super::rollout_rows::RolloutRows;
-use super::room_geometry::{RAY_VALUES, RoomScale, RoomSides, RoomViews, ViewInRoom};
+use super::room_geometry::{RoomScale, RoomSides, RoomViews, ViewInRoom};
 use crate::frame::warp::CameraModel;
 use crate::nn::error::NnError;
 use crate::nn::geometry::camera::{CameraPose, Viewer};
@@ -17,7 +18,7 @@ use crate::nn::geometry::state_channels::StateChannels;
 use crate::nn::model_tensors::ModelTensors;
 use crate::nn::ops::compose::SCENE_CHANNELS;
 use crate::nn::ops::linear::Linear;
-use crate::nn::ops::modulation::perceptron;
+use crate::nn::ops::modulation::{PackedPerceptron, perceptron};
 use crate::nn::ops::sampling::{ImageSize, centred};
 use crate::nn::precision::Precision;
 use crate::nn::spec::{MIN_CHANNEL_STD, ModelSpec};
@@ -179,6 +180,11 @@ impl Scene {
                     scale,
                     views: ViewInRoom::of(views.poses, &cameras, camera, half),
                 };
+                if let Some(layers) = PackedPerceptron::of(&self.layers) {
+                    let mut seen = views.described_to(&layers, RoomSides::of(&self.learned)?);
+                    seen.iter_mut().for_each(|value| *value += MIDDLE_GRAY as f32);
+                    return Ok(Tensor::from_vec(seen, shape, &Device::Cpu)?);
+                }
                 let seen = perceptron(&self.layers, &views.describe(&self.learned)?)?;
                 (seen + MIDDLE_GRAY)?.reshape(shape)?
             }

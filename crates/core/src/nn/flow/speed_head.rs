@@ -9,7 +9,8 @@ use super::depth_views::{KNOWN_VALUES, count_from, depths_before_learning, known
 use super::encoder_views::EncoderViews;
 use crate::frame::warp::CameraModel;
 use crate::nn::error::NnError;
-use crate::nn::geometry::camera::{Viewer, ViewerRays, rotated};
+use crate::nn::geometry::camera::{Viewer, rotated};
+use crate::nn::geometry::viewer_rays::ViewerRays;
 use crate::nn::model_tensors::ModelTensors;
 use crate::nn::ops::activated_convolution::{Activation, activated_convolution};
 use crate::nn::ops::convolution::Convolution3;
@@ -92,7 +93,7 @@ pub(super) fn speed_inputs(contexts: &EncoderViews) -> Vec<f32> {
     for (index, inputs) in all.chunks_exact_mut(half.pixels() * channels).enumerate() {
         let camera = contexts.cameras[index].unwrap_or(CameraModel::USUAL);
         let height_m = camera.height_m.unwrap_or(CameraModel::USUAL_HEIGHT_M);
-        let camera = ViewerRays::from(Viewer::new(camera, size));
+        let camera = ViewerRays::of(Viewer::new(camera, size));
         let depths = depths_before_learning(&camera.rays, height_m);
         let mut frame = contexts.last_frames[index * pixels..(index + 1) * pixels].to_vec();
         let levels = levels(&frame);

@@ -1,19 +1,12 @@
-//! The camera's geometry as the flow network uses it: the ray of each pixel, where a turning camera saw it before, and
-//! where a moving one did.
+//! Where a camera stands, the ray of each pixel, and the place of each point.
 //!
 //! Axes as in ROS: x ahead, y to the left, z up. Places are columns and rows, 0 at the first pixel's middle.
 // A closure's vector instructions reach what is inlined into it, and only that.
 #![allow(clippy::inline_always)]
 
-use std::sync::Arc;
-
-use candle_core::{Result, Shape, Tensor};
-
 use crate::frame::warp::{CameraModel, CameraView, MIN_DEPTH};
-use crate::nn::fused::{FusedOperation, Operand, apply};
 use crate::nn::ops::gathering::{OfPlaces, SAMPLED_TOGETHER};
 use crate::nn::ops::sampling::ImageSize;
-use crate::vectorized::vectorized;
 
 /// Where a camera stands on the floor and where it looks.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -50,6 +43,7 @@ impl CameraPose {
 /// A camera that takes frames of some size.
 #[derive(Clone, Copy, Debug)]
 pub(in crate::nn) struct Viewer {
+    camera: CameraModel,
     view: CameraView,
     size: ImageSize,
 }
@@ -57,9 +51,15 @@ pub(in crate::nn) struct Viewer {
 impl Viewer {
     pub(in crate::nn) fn new(camera: CameraModel, size: ImageSize) -> Self {
         Self {
+            camera,
             view: CameraView::new(camera, size.width, size.height),
             size,
         }
+    }
+
+    /// The camera that takes the frames.
+    pub(super) fn camera(self) -> CameraModel {
+        self.camera
     }
 
     /// The size of its frames.
@@ -99,24 +99,6 @@ impl Viewer {
         places
     }
 
-    /// Where each pixel was before the camera turned by each of the angles, in radians: `[M, P, 2]`.
-    pub(in crate::nn) fn turned(self, yaws: &[f32]) -> Vec<f32> {
-        let rays = self.rays();
-        let mut places = vec![0.0; yaws.len() * 2 * rays.len()];
-        for (places, yaw) in places.chunks_exact_mut(2 * rays.len()).zip(yaws) {
-            let (sin, cos) = yaw.sin_cos();
-            vectorized(
-                #[inline(always)]
-                || {
-                    for (place, &ray) in places.chunks_exact_mut(2).zip(&rays) {
-                        place.copy_from_slice(&self.project(rotated(ray, sin, cos)));
-                    }
-                },
-            );
-        }
-        places
-    }
-
     /// Depth of a point in the robot's axes; of a direction, how the depth changes along it.
     #[inline(always)]
     pub(in crate::nn) fn depth(self, point: [f32; 3]) -> f32 {
@@ -139,111 +121,15 @@ impl Viewer {
     }
 }
 
-/// A camera with the ray of each of its pixels, which are computed once.
-#[derive(Clone, Debug)]
-pub(in crate::nn) struct ViewerRays {
-    pub(in crate::nn) viewer: Viewer,
-    pub(in crate::nn) rays: Arc<[[f32; 3]]>,
-    /// The same, each axis on its own, and zeros after the last pixel.
-    axes: Arc<[Vec<f32>; 3]>,
-}
-
-impl From<Viewer> for ViewerRays {
-    fn from(viewer: Viewer) -> Self {
-        let rays = viewer.rays();
-        let axis = |axis: usize| {
-            let mut values = Vec::with_capacity(rays.len() + SAMPLED_TOGETHER);
-            values.extend(rays.iter().map(|ray| ray[axis]));
-            values.resize(rays.len() + SAMPLED_TOGETHER, 0.0);
-            values
-        };
-        Self {
-            viewer,
-            axes: Arc::new([axis(0), axis(1), axis(2)]),
-            rays: rays.into(),
-        }
-    }
-}
-
-impl ViewerRays {
-    /// The rays of neighbouring pixels, from one on, by axis.
-    #[inline(always)]
-    #[expect(clippy::expect_used, reason = "there are so many zeros after the last pixel")]
-    pub(in crate::nn) fn together(&self, first: usize) -> [&OfPlaces; 3] {
-        // Not `map`, which is not inlined.
-        let [x, y, z] = &*self.axes;
-        let x = x[first..].first_chunk().expect("a ray after the last pixel is a bug");
-        let y = y[first..].first_chunk().expect("a ray after the last pixel is a bug");
-        let z = z[first..].first_chunk().expect("a ray after the last pixel is a bug");
-        [x, y, z]
-    }
-}
-
 /// A direction turned counter-clockwise about the vertical.
 #[inline(always)]
 pub(in crate::nn) fn rotated([ahead, left, up]: [f32; 3], sin: f32, cos: f32) -> [f32; 3] {
     [cos * ahead - sin * left, sin * ahead + cos * left, up]
 }
 
-/// Where each pixel was before the camera turned by `yaw` `[M]`, in radians: `[M, P, 2]`. Gradients go to the yaw.
-pub(in crate::nn) fn turning_places(viewer: Viewer, yaw: &Tensor) -> Result<Tensor> {
-    apply(viewer, [yaw])
-}
-
-impl FusedOperation<1> for Viewer {
-    const NAME: &'static str = "turning-places";
-
-    fn forward(&self, [yaw]: [Operand; 1]) -> Result<(Vec<f32>, Shape)> {
-        let shape = (yaw.layout.shape().dims1()?, self.size.pixels(), 2);
-        Ok((self.turned(yaw.values), Shape::from(shape)))
-    }
-
-    fn backward(&self, [yaw]: [Operand; 1], _places: Operand, gradient: Operand) -> Result<[Option<Vec<f32>>; 1]> {
-        let rays = self.rays();
-        let items = yaw.values.iter().zip(gradient.values.chunks_exact(2 * rays.len()));
-        let sums = items.map(|(yaw, gradient)| {
-            let (sin, cos) = yaw.sin_cos();
-            let rays = rays.iter().zip(gradient.chunks_exact(2));
-            rays.map(|(&ray, gradient)| {
-                let point = rotated(ray, sin, cos);
-                let [column, row] = self.slope(point, [-point[1], point[0], 0.0]);
-                column * gradient[0] + row * gradient[1]
-            })
-            .sum::<f32>()
-        });
-        Ok([Some(sums.collect())])
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::frame::warp::rotation_grid;
-    use crate::nn::gradient_check::assert_gradients;
-
-    const CAMERA: CameraModel = CameraModel {
-        horizontal_fov_rad: 1.0,
-        tilt_down_rad: 0.2,
-        height_m: None,
-    };
-    const SIZE: ImageSize = ImageSize { height: 6, width: 8 };
-
-    #[test]
-    fn turning_agrees_with_the_warp_of_frames() {
-        let viewer = Viewer::new(CAMERA, SIZE);
-        let places = viewer.turned(&[0.3]);
-        let expected = rotation_grid(CAMERA, SIZE.width, SIZE.height, 0.3);
-        for (place, expected) in places.chunks_exact(2).zip(expected) {
-            assert!((place[0] + 0.5 - expected[0]).abs() < 1e-4 && (place[1] + 0.5 - expected[1]).abs() < 1e-4);
-        }
-    }
-
-    #[test]
-    fn gradients_of_the_yaw_agree_with_differences() {
-        let viewer = Viewer::new(CAMERA, SIZE);
-        let yaw = Tensor::new(&[0.1f32, -0.4, 0.0], &candle_core::Device::Cpu).unwrap();
-        assert_gradients(&[yaw], 1e-3, |inputs| turning_places(viewer, &inputs[0]));
-    }
 
     #[test]
     fn a_motion_leads_from_one_pose_to_the_other() {

@@ -56,6 +56,24 @@ pub(super) fn of_pairs(pairs: &[[f32; 2 * PAIR_VALUES]; PAIRS], instructions: In
     values
 }
 
+/// Writes the values of neighbouring places, given by value, as one row for each of the first places. Rows have a multiple of 16 values.
+#[inline(always)]
+pub(in crate::nn) fn write_rows<const VALUES: usize>(
+    values: &[OfPlaces; VALUES],
+    rows: &mut [[f32; VALUES]],
+    instructions: Instructions,
+) {
+    if instructions.have_avx512() && rows.len() == SAMPLED_TOGETHER {
+        #[cfg(target_arch = "x86_64")]
+        return x86::write_rows(values, rows, instructions);
+    }
+    for (at, row) in rows.iter_mut().enumerate() {
+        for value in 0..VALUES {
+            row[value] = values[value][at];
+        }
+    }
+}
+
 /// The values of some neighbouring places from `first` on; zeros after the last place.
 #[inline(always)]
 pub(in crate::nn) fn read_together(values: &[f32], first: usize) -> OfPlaces {
@@ -93,6 +111,23 @@ mod tests {
                 for (pixel, &found) in pixels.iter().enumerate() {
                     assert_eq!(found, (100 * (pixel / 2) + pixel % 2 * PAIR_VALUES + value) as f32);
                 }
+            }
+        }
+    }
+
+    #[test]
+    fn rows_hold_the_values_of_their_places() {
+        let values: [OfPlaces; 48] =
+            std::array::from_fn(|value| std::array::from_fn(|place| (100 * place + value) as f32));
+        for count in [SAMPLED_TOGETHER, 7] {
+            let mut rows = vec![[[0.0; 48]; SAMPLED_TOGETHER]; 2];
+            write_rows(&values, &mut rows[0][..count], Instructions::PLAIN);
+            vectorized_by(|instructions| write_rows(&values, &mut rows[1][..count], instructions));
+            for (place, row) in rows.iter().flat_map(|rows| rows.iter().take(count).enumerate()) {
+                assert_eq!(
+                    row.map(|value| value as usize),
+                    std::array::from_fn(|value| 100 * place + value)
+                );
             }
         }
     }

@@ -20,16 +20,15 @@ pub(in crate::nn) fn silu(x: &Tensor) -> Result<Tensor> {
 
 /// Linear layers with [`silu`] between them.
 pub(in crate::nn) fn perceptron(layers: &[Linear], x: &Tensor) -> Result<Tensor> {
-    if let Some(packed) = layers
-        .iter()
-        .map(|layer| layer.packed.as_deref())
-        .collect::<Option<Vec<_>>>()
-    {
-        let outputs = packed.last().map_or(0, |last| last.outputs());
-        let out = with_values(x, |x| {
-            packed_perceptron(&packed, x, x.len() / layers[0].weight.dims()[0])
+    if let Some(packed) = PackedPerceptron::of(layers) {
+        let (rows, inputs) = x.dims2()?;
+        let mut out = vec![0.0; rows * packed.outputs()];
+        with_values(x, |x| {
+            packed.run(&mut out, inputs, |first, read| {
+                read.copy_from_slice(&x[first * inputs..][..read.len()]);
+            });
         })?;
-        return Tensor::from_vec(out, ((), outputs), x.device());
+        return Tensor::from_vec(out, (rows, packed.outputs()), x.device());
     }
     let mut values = x.clone();
     for (index, layer) in layers.iter().enumerate() {
@@ -44,32 +43,44 @@ pub(in crate::nn) fn perceptron(layers: &[Linear], x: &Tensor) -> Result<Tensor>
 /// Rows that go through all layers together, so that what is between the layers stays in the fastest cache.
 const ROWS_TOGETHER: usize = 64;
 
-fn packed_perceptron(layers: &[&RowWeights], x: &[f32], rows: usize) -> Vec<f32> {
-    let outputs = layers.last().map_or(0, |last| last.outputs());
-    let inputs = x.len() / rows.max(1);
-    let mut out = vec![0.0; rows * outputs];
-    let widest = layers.iter().map(|layer| layer.outputs()).max().unwrap_or(0);
-    let mut buffers = [0, 1].map(|_| vec![0.0; ROWS_TOGETHER * widest]);
-    for (x, out) in x
-        .chunks(ROWS_TOGETHER * inputs)
-        .zip(out.chunks_mut(ROWS_TOGETHER * outputs))
-    {
-        let rows = out.len() / outputs;
-        let [from, to] = &mut buffers;
-        let mut length = 0;
-        for (index, layer) in layers.iter().enumerate() {
-            let read = if index == 0 { x } else { &from[..length] };
-            if index + 1 == layers.len() {
-                layer.multiply_rows(read, out);
-                break;
+/// A perceptron whose weights are packed.
+pub(in crate::nn) struct PackedPerceptron<'a>(Vec<&'a RowWeights>);
+
+impl<'a> PackedPerceptron<'a> {
+    /// Of these layers; `None` if they are not packed, or there are none.
+    pub(in crate::nn) fn of(layers: &'a [Linear]) -> Option<Self> {
+        let packed: Option<Vec<&RowWeights>> = layers.iter().map(|layer| layer.packed.as_deref()).collect();
+        packed.filter(|layers| !layers.is_empty()).map(Self)
+    }
+
+    /// Values of a row of its result.
+    pub(in crate::nn) fn outputs(&self) -> usize {
+        self.0.last().map_or(0, |last| last.outputs())
+    }
+
+    /// Fills `out` with the results of all rows. `read` writes the inputs of some rows, from the one with that index on.
+    pub(in crate::nn) fn run(&self, out: &mut [f32], inputs: usize, mut read: impl FnMut(usize, &mut [f32])) {
+        let outputs = self.outputs();
+        let widest = self.0.iter().map(|layer| layer.outputs()).fold(inputs, usize::max);
+        let mut buffers = [0, 1].map(|_| vec![0.0; ROWS_TOGETHER * widest]);
+        for (index, out) in out.chunks_mut(ROWS_TOGETHER * outputs).enumerate() {
+            let rows = out.len() / outputs;
+            let [from, to] = &mut buffers;
+            let mut length = rows * inputs;
+            read(index * ROWS_TOGETHER, &mut from[..length]);
+            for (layer, weights) in self.0.iter().enumerate() {
+                if layer + 1 == self.0.len() {
+                    weights.multiply_rows(&from[..length], out);
+                    break;
+                }
+                let sums = &mut to[..rows * weights.outputs()];
+                weights.multiply_rows(&from[..length], sums);
+                activate_all(sums);
+                length = sums.len();
+                std::mem::swap(from, to);
             }
-            length = rows * layer.outputs();
-            layer.multiply_rows(read, &mut to[..length]);
-            activate_all(&mut to[..length]);
-            std::mem::swap(from, to);
         }
     }
-    out
 }
 
 /// `SiLU` of each value, in place.

@@ -3,7 +3,8 @@
 use candle_core::{DType, Device, Result, Tensor};
 
 use super::cameras::{Cameras, Vectors};
-use crate::nn::flow::room_geometry::{FIRST_SIDES, LOWEST, MIN_DISTANCE, OCTAVES, RoomScale, SIDE_GAIN};
+use crate::nn::flow::ray_description::{LOWEST, OCTAVES};
+use crate::nn::flow::room_geometry::{FIRST_SIDES, MIN_DISTANCE, RoomScale, SIDE_GAIN};
 use crate::nn::geometry::camera::CameraPose;
 use crate::nn::plain::sampling::{Places, at_least};
 

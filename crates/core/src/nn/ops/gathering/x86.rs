@@ -104,6 +104,83 @@ fn of_pairs_by_halves(pairs: &[[f32; LANES]; LANES / 2]) -> [[f32; LANES]; PAIR_
     all
 }
 
+/// As [`super::write_rows`], of as many rows as places.
+#[inline(always)]
+#[expect(unsafe_code, reason = "the machine has the instructions, and that is checked")]
+pub(super) fn write_rows<const VALUES: usize>(
+    values: &[OfPlaces; VALUES],
+    rows: &mut [[f32; VALUES]],
+    instructions: Instructions,
+) {
+    assert!(instructions.have_avx512(), "a loop without AVX-512 is a bug");
+    const { assert!(VALUES.is_multiple_of(LANES), "rows are whole vectors") };
+    for (part, rows) in rows.as_chunks_mut::<LANES>().0.iter_mut().enumerate() {
+        for (block, values) in values.as_chunks::<LANES>().0.iter().enumerate() {
+            let mut square = [[0.0; LANES]; LANES];
+            for (row, values) in square.iter_mut().zip(values) {
+                *row = values.as_chunks::<LANES>().0[part];
+            }
+            // SAFETY: the machine has the instructions.
+            let square = unsafe { turned(&square) };
+            for (row, values) in rows.iter_mut().zip(square) {
+                row.as_chunks_mut::<LANES>().0[block] = values;
+            }
+        }
+    }
+}
+
+/// Rows as columns.
+#[target_feature(enable = "avx512f")]
+#[inline]
+fn turned(rows: &[[f32; LANES]; LANES]) -> [[f32; LANES]; LANES] {
+    let mut vectors = [_mm512_setzero_ps(); LANES];
+    for row in 0..LANES {
+        vectors[row] = floats(rows[row]);
+    }
+    exchange::<8>(&mut vectors);
+    exchange::<4>(&mut vectors);
+    exchange::<2>(&mut vectors);
+    exchange::<1>(&mut vectors);
+    let mut columns = [[0.0; LANES]; LANES];
+    for row in 0..LANES {
+        columns[row] = values(vectors[row]);
+    }
+    columns
+}
+
+/// Blocks of two rows that are so far apart change places.
+#[target_feature(enable = "avx512f")]
+#[inline]
+fn exchange<const APART: usize>(vectors: &mut [__m512; LANES]) {
+    let upper = indices(const { exchanged(APART, false) });
+    let lower = indices(const { exchanged(APART, true) });
+    for row in 0..LANES {
+        if row & APART == 0 {
+            let (above, below) = (vectors[row], vectors[row + APART]);
+            vectors[row] = _mm512_permutex2var_ps(above, upper, below);
+            vectors[row + APART] = _mm512_permutex2var_ps(above, lower, below);
+        }
+    }
+}
+
+/// Where each lane of a row comes from, after blocks of so many lanes changed places with the row that is as far below: lanes of the
+/// upper row, then those of the lower one.
+const fn exchanged(apart: usize, is_lower: bool) -> [i32; LANES] {
+    let mut from = [0; LANES];
+    let mut lane = 0;
+    while lane < LANES {
+        let is_right = lane & apart != 0;
+        from[lane] = match (is_lower, is_right) {
+            (false, false) => lane,
+            (false, true) => LANES + lane - apart,
+            (true, false) => lane + apart,
+            (true, true) => LANES + lane,
+        } as i32;
+        lane += 1;
+    }
+    from
+}
+
 /// The largest index; a negative one counts as larger than all others.
 #[target_feature(enable = "avx512f")]
 #[inline]
