@@ -18,7 +18,7 @@ from foreframe.rerun_log import RerunLog
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--server", default=foreframe.client.DEFAULT_URL)
+    parser.add_argument("--server", help="the URL of a running server; default: start one with the program `foreframe`")
     parser.add_argument("--key")
     parser.add_argument("--model", default="moving-flow")
     parser.add_argument("--frames", type=int, default=300)
@@ -29,7 +29,8 @@ def main() -> None:
         recording.save(arguments.save)
     else:
         recording.spawn()
-    with foreframe.Client(arguments.server, key=arguments.key) as client:
+    server = None if arguments.server else foreframe.serve()
+    with foreframe.Client(arguments.server or server.url, key=arguments.key) as client:
         model = client.model(arguments.model)
         scenario = model.lineage.get("scenario") or "moving-observer"
         log = RerunLog(recording, model.spec.period_s)

@@ -118,10 +118,17 @@ fn next_steps(out: &Path, info: &DatasetInfo, flags: &str) -> Result<(), CliErro
     let dataset = shell_path(out);
     print_line(format!("next: foreframe inspect {dataset}{flags}"))?;
     let config = TrainConfig::layered(PRESET, None, &conditioning(info))?;
+    // A tenth of the frames is for validation, a tenth for tests, and windows across a cut are left out.
+    let least = 20 * (config.model.context + config.model.horizon);
     if first_trainable(out, info, [config])?.is_none() {
+        let episodes = match info.episode_count {
+            1 => "one episode".to_owned(),
+            count => format!("{count} episodes"),
+        };
         return print_line(format!(
-            "      record more before you train: {} frames in {} episodes are too few for training and validation",
-            info.frame_count, info.episode_count
+            "      record more before you train: {} frames in {episodes} are too few for training and validation; a recording \
+             without a break needs about {least}",
+            info.frame_count
         ));
     }
     let mut settings = vec![format!("name={}", name_from(&info.name, "recording"))];

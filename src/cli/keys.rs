@@ -5,7 +5,7 @@ use super::new_key::{KeyOrder, create_key};
 use super::process::print_line;
 use super::settings::{CommonArgs, open_store};
 use super::workspace::block_on;
-use foreframe_jobs::store::{Author, KeyScope, Store};
+use foreframe_jobs::store::{Author, KeyRow, KeyScope, Store};
 
 const SECONDS_PER_DAY: f64 = 86_400.0;
 
@@ -41,8 +41,8 @@ enum KeysCommand {
     /// Revoke a key: requests with it are refused
     #[command(after_help = "Example:\n  foreframe keys revoke 5f0c2ab91d34")]
     Revoke {
-        /// The key's id, as in the list
-        id: String,
+        /// The key's id, as in the list, or its name, if no other valid key has it
+        key: String,
     },
 }
 
@@ -71,7 +71,7 @@ pub(super) fn run(args: &KeysArgs) -> Result<(), CliError> {
         match &args.action {
             KeysCommand::Create(args) => create(&store, args).await,
             KeysCommand::List => list(&store).await,
-            KeysCommand::Revoke { id } => revoke(&store, id).await,
+            KeysCommand::Revoke { key } => revoke(&store, key).await,
         }
     })
 }
@@ -134,20 +134,34 @@ async fn list(store: &Store) -> Result<(), CliError> {
     Ok(())
 }
 
-async fn revoke(store: &Store, id: &str) -> Result<(), CliError> {
+async fn revoke(store: &Store, wanted: &str) -> Result<(), CliError> {
     let now_s = store.now_s().await?;
-    if store.revoke_key(id, now_s, &Author::CommandLine).await? {
-        let is_last = store.list_keys().await?.iter().all(|key| !key.is_valid(now_s));
-        let consequence = if is_last {
-            "; it was the last valid key: every request is refused until another is created"
-        } else {
-            ""
-        };
-        return print_line(format!("{id} is revoked{consequence}"));
-    }
-    Err(CliError::Usage(format!(
-        "there is no valid key {id}; foreframe keys list lists them"
-    )))
+    let mut valid = store.list_keys().await?;
+    valid.retain(|key| key.is_valid(now_s));
+    let is_wanted = |key: &&KeyRow| key.id == wanted || key.name == wanted;
+    let found: Vec<&str> = valid.iter().filter(is_wanted).map(|key| &*key.id).collect();
+    let id = match found[..] {
+        [id] => id,
+        [] => {
+            return Err(CliError::Usage(format!(
+                "there is no valid key {wanted}; foreframe keys list lists them"
+            )));
+        }
+        [..] => {
+            return Err(CliError::Usage(format!(
+                "{} valid keys have the name {wanted}; give the id of one: {}",
+                found.len(),
+                found.join(", ")
+            )));
+        }
+    };
+    store.revoke_key(id, now_s, &Author::CommandLine).await?;
+    let consequence = if valid.len() == 1 {
+        "; it was the last valid key: every request is refused until another is created"
+    } else {
+        ""
+    };
+    print_line(format!("{id} is revoked{consequence}"))
 }
 
 #[cfg(test)]

@@ -376,7 +376,7 @@ fn an_interval_of_few_blocks_is_marked() {
     assert!((2..10).contains(&blocks) && !scores.intervals_are_reliable);
     let markdown = report.to_markdown();
     let expected =
-        format!("Do not trust the intervals of this set: {blocks} blocks are too few, at least 10 are needed.");
+        format!("Do not trust the intervals of this set: they rest on {blocks} blocks, and at least 10 are needed.");
     assert!(
         markdown.contains(&expected) && markdown.contains("(do not trust it)"),
         "{markdown}"

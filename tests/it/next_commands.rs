@@ -84,7 +84,7 @@ fn too_short_a_recording_is_said_to_be_too_short() {
     recordings::tub(&dir.path().join("tub"), 50);
     let printed = run(dir.path(), "foreframe import tub");
     assert!(
-        printed.contains("      record more before you train: 50 frames in 1 episodes"),
+        printed.contains("      record more before you train: 50 frames in one episode are"),
         "{printed}"
     );
 }

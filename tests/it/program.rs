@@ -210,6 +210,25 @@ fn a_public_server_requires_an_api_key() {
 }
 
 #[test]
+fn a_key_is_revoked_by_its_id_or_by_a_name_that_only_it_has() {
+    let dir = tempfile::tempdir().unwrap();
+    let keys = |arguments: &[&str]| output(dir.path(), &[&["keys"], arguments].concat());
+    let ids = ["ada", "bob", "bob"].map(|name| {
+        let key = text(&keys(&["create", name]).stdout);
+        key.split('_').nth(1).unwrap().to_owned()
+    });
+    assert!(text(&keys(&["revoke", "ada"]).stdout).starts_with(&format!("{} is revoked", ids[0])));
+    assert!(text(&keys(&["revoke", "ada"]).stderr).contains("there is no valid key ada"));
+    let unclear = text(&keys(&["revoke", "bob"]).stderr);
+    assert!(
+        unclear.contains("2 valid keys have the name bob") && ids[1..].iter().all(|id| unclear.contains(id)),
+        "{unclear}"
+    );
+    assert!(keys(&["revoke", &ids[1]]).status.success());
+    assert!(text(&keys(&["revoke", "bob"]).stdout).contains("it was the last valid key"));
+}
+
+#[test]
 fn invalid_directories_are_refused_at_startup() {
     let dir = tempfile::tempdir().unwrap();
     std::fs::write(dir.path().join("file"), "").unwrap();

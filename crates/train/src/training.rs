@@ -123,8 +123,13 @@ pub fn run(
             validation_loss: point.validation_loss,
         });
     }
+    // Most networks have no pre-training.
+    let stage = match state.progress.stage {
+        TrainingStage::Pretrain if config.pretrain.steps == 0 => TrainingStage::Sequence,
+        stage => stage,
+    };
     observer.on_event(TrainingEvent::Started {
-        stage: state.progress.stage,
+        stage,
         step: state.progress.step,
         windows: plan.train.len(),
     });

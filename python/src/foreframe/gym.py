@@ -152,6 +152,8 @@ class SimulatorStarts:
         latest: int = 25,
         world: Mapping[str, Any] | None = None,
     ) -> None:
+        if not isinstance(context, int):
+            raise TypeError(f"context is {context!r}; give the frames that the model sees, client.spec(model).context")
         self._environment = client.environment(scenario, world=world)
         self._context = context
         self._latest = latest

@@ -238,7 +238,7 @@ class PlannedActions:
     #: The least distance to what the last frame shows, in metres; None if that is not known, or nothing is seen.
     clearance_m: float | None
     #: ``[steps, height, width]``: the predicted frames; None if there was no time to predict them.
-    frames: Gray | None
+    frames: Gray | None = field(repr=False)
     #: ``[steps]``: mean squared error to expect of each frame; empty if it is not known.
     expected_mse: Floats
 
@@ -264,7 +264,7 @@ class Plan(PlannedActions):
     model: str
     version: int
     #: The next best plans, which differ, best first.
-    runners_up: tuple[PlannedActions, ...]
+    runners_up: tuple[PlannedActions, ...] = field(repr=False)
     #: Whether the plan is safe, as far as it was checked; otherwise ``reason`` says why not.
     safe: bool
     reason: str | None
@@ -272,7 +272,7 @@ class Plan(PlannedActions):
     #: be, if it finds them.
     clearance_checked: bool
     #: What stands in the way; None unless it was asked for (``with_obstacles``) and checked.
-    obstacles: Obstacles | None
+    obstacles: Obstacles | None = field(repr=False)
     novelty: float | None
     #: Plans that were judged, and those whose frames were predicted.
     samples: int

@@ -69,7 +69,12 @@ pub(super) fn print_choice(manifest: &Manifest, choice: &PlanChoice) -> Result<(
         print_line(line)?;
     }
     if !choice.clearance_checked {
-        print_line("the way was not checked: the model estimates no depth, or its actions are not speeds")?;
+        let sees_depth = manifest.spec.flow().is_some_and(|flow| flow.layers.depth);
+        print_line(if sees_depth {
+            "the way was not checked: the model's actions are not speeds (m/s and rad/s)"
+        } else {
+            "the way was not checked: the model estimates no depth, as \"rooms\" does"
+        })?;
     }
     print_line(format!(
         "{} plans judged, {} of them predicted",

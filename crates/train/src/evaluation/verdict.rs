@@ -19,6 +19,10 @@ impl SetScores {
                 format!("about as good as {baseline}: the interval of the skill contains 0; {ADVICE}")
             }
             0.0.. => format!("better than {baseline} by {percent:.0} %"),
+            ..-1.0 => {
+                let times = 1.0 - mean;
+                format!("worse than {baseline}: its error is {times:.1} times as large; {ADVICE}")
+            }
             _ => format!("worse than {baseline} by {percent:.0} %; {ADVICE}"),
         };
         self.with_doubt(verdict)
@@ -103,6 +107,12 @@ mod tests {
                 -0.15,
                 (-0.2, -0.1),
                 "worse than the strongest baseline (copy last frame) by 15 %; more data or a longer training may help",
+            ),
+            (
+                -1.46,
+                (-1.63, -1.31),
+                "worse than the strongest baseline (copy last frame): its error is 2.5 times as large; more data or a longer training \
+                 may help",
             ),
             (
                 0.04,
