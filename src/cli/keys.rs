@@ -100,7 +100,7 @@ fn duration_s(text: &str) -> Result<f64, String> {
         Some(f64::from(number) * seconds)
     });
     let in_range = parsed.filter(|seconds| (1.0..=36_500.0 * SECONDS_PER_DAY).contains(seconds));
-    in_range.ok_or_else(|| "write a whole number with s, m, h or d, as in 30d".to_owned())
+    in_range.ok_or_else(|| "write a whole number with s, m, h or d, as in 30d: 1s to 36500d".to_owned())
 }
 
 fn rate(text: &str) -> Result<f64, String> {

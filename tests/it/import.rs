@@ -372,6 +372,61 @@ fn damage_in_a_tub_is_named_or_skipped() {
 }
 
 #[test]
+fn options_that_name_values_are_refused_where_there_are_frames_alone() {
+    let dir = tempfile::tempdir().unwrap();
+    let images = folder(dir.path());
+    fs::remove_file(images.join("log.csv")).unwrap();
+    let array = dir.path().join("frames.npy");
+    fs::write(&array, []).unwrap();
+    let name = || Some("x".to_owned());
+    for (source, what) in [
+        (&images, "a folder of images without a CSV file"),
+        (&array, "an .npy file"),
+    ] {
+        for (option, options) in [
+            (
+                "--image",
+                ImportOptions {
+                    image: name(),
+                    ..small()
+                },
+            ),
+            (
+                "--time",
+                ImportOptions {
+                    time: name(),
+                    ..small()
+                },
+            ),
+            (
+                "--action",
+                ImportOptions {
+                    actions: vec!["x".to_owned()],
+                    ..small()
+                },
+            ),
+            (
+                "--state",
+                ImportOptions {
+                    states: vec!["x".to_owned()],
+                    ..small()
+                },
+            ),
+        ] {
+            let options = ImportOptions {
+                rate_hz: Some(5.0),
+                ..options
+            };
+            let error = run(source, &dir.path().join("out"), options).unwrap_err().to_string();
+            assert_eq!(
+                error,
+                format!("{what} holds frames alone, so there is nothing that {option} can name")
+            );
+        }
+    }
+}
+
+#[test]
 fn csv_mistakes_name_column_and_line() {
     let dir = tempfile::tempdir().unwrap();
     let source = folder(dir.path());

@@ -178,6 +178,31 @@ async fn a_training_after_an_evaluation_starts_from_the_active_version() {
 }
 
 #[tokio::test]
+async fn a_version_that_a_waiting_job_names_is_not_deleted() {
+    let dir = tempfile::tempdir().unwrap();
+    let app = app(dir.path(), ServerConfig::default());
+    let training = long_training_from_second_version(&app).await;
+    let long = json!({"kind": "collect", "name": "long", "scenario": "static-observer", "trials": 100_000});
+    let evaluation = json!({"kind": "evaluate", "model": "fresh", "version": 2, "dataset": "seen", "windows": 40,
+        "resamples": 100});
+    for body in [&long, &training, &evaluation] {
+        assert_eq!(post(&app, JOBS, body).await.status, 202);
+    }
+    let delete = async || {
+        let delete = Request::delete("/v1/models/fresh/versions/2");
+        send(&app, delete.body(Body::empty()).unwrap()).await
+    };
+    for job in ["job-5", "job-6"] {
+        let in_use =
+            format!("version 2 of model \"fresh\" is in use by {job}; wait until that job has ended, or cancel it");
+        assert_eq!(delete().await.detail(409), in_use);
+        post(&app, &format!("{JOBS}/{job}/cancel"), &Value::Null).await;
+    }
+    assert_eq!(delete().await.status, 204);
+    post(&app, &format!("{JOBS}/job-4/cancel"), &Value::Null).await;
+}
+
+#[tokio::test]
 async fn all_parts_use_the_version_that_was_active_when_the_job_was_submitted() {
     let dir = tempfile::tempdir().unwrap();
     let app = app(dir.path(), ServerConfig::default());

@@ -287,6 +287,32 @@ async fn a_key_over_its_rate_is_told_when_to_try_again() {
 }
 
 #[tokio::test]
+async fn each_client_has_idempotency_keys_of_its_own() {
+    let (_dir, store, keys, app) = app_with_keys(true).await;
+    let clients = [new_key(&store, &keys).await, new_key(&store, &keys).await];
+    let submit = async |key: &NewKey, name: &str| {
+        let body = json!({"kind": "collect", "name": name, "scenario": "static-observer", "trials": 100_000});
+        let request = Request::post("/v1/jobs")
+            .header("authorization", format!("Bearer {}", key.text))
+            .header("content-type", "application/json")
+            .header("idempotency-key", "same");
+        send(&app, request.body(Body::from(body.to_string())).unwrap()).await
+    };
+    let ids = [
+        submit(&clients[0], "a").await.json(),
+        submit(&clients[1], "b").await.json(),
+    ];
+    assert_ne!(ids[0]["id"], ids[1]["id"]);
+    assert_eq!(submit(&clients[1], "b").await.json()["id"], ids[1]["id"]);
+    assert!(
+        submit(&clients[1], "a")
+            .await
+            .detail(422)
+            .contains("it was used for a different job")
+    );
+}
+
+#[tokio::test]
 async fn changes_are_audited_with_their_key() {
     let (_dir, store, keys, app) = app_with_keys(true).await;
     let (one, other) = (new_key(&store, &keys).await, new_key(&store, &keys).await);

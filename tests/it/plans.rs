@@ -1,12 +1,19 @@
 //! Plans over HTTP: what a goal leads to, bad goals and budgets, and the same search in the library.
 
-use std::time::Instant;
+use std::cell::Cell;
+use std::path::Path;
+use std::time::{Duration, Instant};
 
 use foreframe::server::ServerConfig;
 use foreframe::server::protocol::{ClientMessage, Codec, FrameMessage};
 use foreframe_core::frame::codec;
 use foreframe_core::nn::{Conditioning, ModelSpec};
-use foreframe_core::registry::Model;
+use foreframe_core::planning::{
+    ActionLimit, CandidateKind, PlanSettings, Planner, PlannerInput, SolverKind, SolverSettings,
+};
+use foreframe_core::registry::{self, Model};
+use foreframe_core::serving::{ConditioningInput, Task, compute_task};
+use foreframe_core::types::RobotState;
 use serde_json::{Value, json};
 
 use crate::client::{Client, SessionHandle, numbered_frame};
@@ -221,6 +228,60 @@ async fn the_budget_is_kept_and_the_answer_is_to_stop_if_nothing_was_judged() {
     assert_eq!((&answer["safe"], &answer["reason"]), (&json!(false), &json!("no-time")));
     assert_eq!(answer["plan"]["kind"], "stop");
     assert!(took.as_millis() < 2000, "{took:?}");
+}
+
+#[test]
+fn a_plan_out_of_the_training_is_not_chosen_though_it_was_not_predicted() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let model = registry::load(&root.join("models/moving-flow")).unwrap();
+    let request: Value = serde_json::from_slice(&std::fs::read(root.join("examples/request.json")).unwrap()).unwrap();
+    let state: RobotState = serde_json::from_value(request["state"].clone()).unwrap();
+    let image = |place: usize| {
+        codec::decode(&std::fs::read(root.join(format!("examples/frames/frame-00{place}.png"))).unwrap())
+    };
+    let frames: Vec<_> = (0..5).map(|place| image(place).unwrap()).collect();
+    let far = ActionLimit {
+        low: -5.0,
+        high: 5.0,
+        max_change: None,
+    };
+    for seed in 1..=5 {
+        let settings = PlanSettings {
+            solver: SolverSettings {
+                kind: SolverKind::RandomShooting,
+                seed,
+                ..SolverSettings::default()
+            },
+            limits: Some(vec![far; 2]),
+            budget: Some(Duration::from_millis(100)),
+            ..PlanSettings::default()
+        };
+        let input = PlannerInput {
+            goal: serde_json::from_value(ahead()).unwrap(),
+            settings,
+            state: Some(state.clone()),
+            ..PlannerInput::default()
+        };
+        let mut planner = Planner::new(&model, input).unwrap();
+        // After the search there is no time to predict what it found.
+        let elapsed = Cell::new(Duration::ZERO);
+        let clock = || elapsed.replace(elapsed.get() + Duration::from_millis(10));
+        while let Some(batch) = planner.next_batch(&clock).unwrap() {
+            let inputs =
+                ConditioningInput::of_plans(batch.plans, Some(state.clone()), Some(5), &model.manifest).unwrap();
+            let task = Task::rollout(frames.clone(), Vec::new(), None, inputs, &model.manifest).unwrap();
+            planner
+                .record(compute_task(&model, &task).unwrap(), Duration::from_secs(1))
+                .unwrap();
+        }
+        let choice = planner.finish();
+        assert_eq!((choice.predicted, choice.best.kind), (1, CandidateKind::Stop));
+        assert!(
+            choice.runners_up.iter().all(|other| other.novelty > Some(0.99)),
+            "{choice:?}"
+        );
+        assert!(choice.best.novelty < Some(0.95), "{choice:?}");
+    }
 }
 
 #[tokio::test]

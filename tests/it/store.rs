@@ -317,6 +317,26 @@ async fn jobs_are_listed_newest_first_and_old_ones_deleted() {
     }
 }
 
+#[tokio::test]
+async fn a_job_is_known_while_one_that_waited_for_it_has_not_succeeded() {
+    for (_dir, store) in stores("forgotten").await {
+        let first = enqueued(&store).await.id;
+        let waiting = NewJob {
+            after: Some(first),
+            ..job(None, None)
+        };
+        store.enqueue(waiting, 100, 1.0).await.unwrap();
+        store.cancel_queued(first, 2.0, &Author::CommandLine).await.unwrap();
+        assert_eq!(store.forget_ended(0).await.unwrap(), []);
+        // It can be resumed, so it may ask again.
+        let second = JobId::new(2);
+        store.cancel_queued(second, 3.0, &Author::CommandLine).await.unwrap();
+        assert_eq!(store.forget_ended(1).await.unwrap(), []);
+        assert_eq!(store.forget_ended(0).await.unwrap(), [second]);
+        assert_eq!(store.forget_ended(0).await.unwrap(), [first]);
+    }
+}
+
 fn model() -> ModelName {
     "m".parse().unwrap()
 }

@@ -237,7 +237,7 @@ def walk():
     """An archive of 30 images at 5 frames/s."""
     archive = io.BytesIO()
     with zipfile.ZipFile(archive, "w") as file:
-        file.writestr("walk/log.csv", "timestamp,file\n" + "".join(f"{index / 5},{index}.png\n" for index in range(30)))
+        file.writestr("walk/log.csv", "timestamp,file,speed\n" + "".join(f"{index / 5},{index}.png,1\n" for index in range(30)))
         for index in range(30):
             image = io.BytesIO()
             Image.effect_noise((64, 48), 20 + index).save(image, "PNG")
@@ -258,7 +258,9 @@ def a_dropped_file_is_imported(browser, server):
     drop.dispatch_event("drop", {"dataTransfer": dropped("notes.txt", b"no recording")})
     expect(drop.locator(".wrong")).to_contain_text("Drop one file: an archive")
     drop.dispatch_event("drop", {"dataTransfer": dropped("My Walk.zip", walk())})
-    page.get_by_role("link", name="open it").click(timeout=60_000)
+    job = lambda name: page.locator(".making", has_text=f"import {name}")
+    expect(job("my-walk")).to_contain_text("not imported: speed", timeout=60_000)
+    job("my-walk").get_by_role("link", name="open it").click(timeout=60_000)
     assert "set=my-walk" in page.evaluate("location.hash")
     wait_for_pictures(page, 1)
     # The second import of that name is refused, and its upload can be imported under another name.
@@ -268,8 +270,12 @@ def a_dropped_file_is_imported(browser, server):
     assert page.locator("form.drop input[name=source]").input_value().startswith("upload:")
     page.locator("form.drop input[name=name]").fill("another-walk")
     page.get_by_role("button", name="Import", exact=True).click()
-    page.get_by_role("link", name="open it").click(timeout=60_000)
+    job("another-walk").get_by_role("link", name="open it").click(timeout=60_000)
     assert "set=another-walk" in page.evaluate("location.hash")
+    page.on("dialog", lambda dialog: dialog.accept())
+    page.get_by_role("button", name="Delete this data set").click()
+    expect(page.locator("a.card", has_text="my-walk")).to_have_count(1)
+    expect(page.locator("a.card", has_text="another-walk")).to_have_count(0)
     page.context.close()
 
 
@@ -289,10 +295,35 @@ def a_training_is_watched(browser, server):
     form.get_by_label("Other settings").fill("pretrain.steps=20\nrun.validate_every_steps=10\nmodel.hidden=16\nmodel.features=16")
     expect(page.locator(".estimate")).to_have_text(re.compile(r"Memory: at least [0-9.]+ [MG]iB of "))
     page.get_by_role("button", name="Train", exact=True).click()
+    state = page.locator(".watched h2 span")
+    page.locator(".watched").get_by_role("button", name="Cancel").click()
+    expect(state).to_have_text("cancelled", timeout=60_000)
+    page.locator(".watched").get_by_role("button", name="Resume").click()
     wait_until(lambda: page.locator(".watched .plot canvas").count() == 1, "losses", 120)
     width = lambda: page.evaluate("document.querySelector('.sample img')?.naturalWidth")
     wait_until(lambda: width() == 5 * 64 + 4 * 2, "a sample prediction", 120)
     wait_until(lambda: page.locator("article h3", has_text="tiny").count() == 1, "the new model's card", 240)
+    expect(state).to_have_text("succeeded", timeout=60_000)
+    page.context.close()
+
+
+def a_new_version_is_activated_and_evaluated(browser, server):
+    """The training and the evaluation are somebody else's; the open page shows what they change."""
+    page = browser.open("train")
+    card = page.locator("article", has_text="tiny")
+    expect(card).to_contain_text("skill not measured")
+    settings = {"pretrain": {"steps": 2}, "sequence": {"steps": 2}, "model": {"hidden": 16, "features": 16}}
+    server.post("/v1/jobs", {"kind": "train", "name": "tiny", "dataset": "room", "preset": "static", "settings": settings})
+    expect(card.locator(".versions")).to_contain_text("version 2", timeout=120_000)
+    page.get_by_role("button", name="Activate version 2").click(timeout=60_000)
+    expect(page.locator(".watched")).to_contain_text("Published as version 2 of tiny; it is active")
+    evaluation = server.post("/v1/jobs", {"kind": "evaluate", "model": "tiny", "dataset": "room", "windows": 10})["id"]
+    expect(card).not_to_contain_text("skill not measured", timeout=120_000)
+    page.locator(".jobs a", has_text=evaluation).click()
+    expect(page.locator(".report h2 code")).to_have_text(["tiny", "room"])
+    with page.expect_download() as download:
+        page.get_by_role("button", name="download the report").click()
+    assert pathlib.Path(download.value.path()).read_text().startswith("# Model `tiny`")
     page.context.close()
 
 
@@ -402,7 +433,7 @@ def main():
     job = server.post("/v1/jobs", collect)["id"]
     wait_until(lambda: (server.get(f"/v1/jobs/{job}") or {}).get("state") == "succeeded", "a data set", 240)
     tests = [opens_on_the_best_drivable_model, a_model_of_rooms_is_driven_in_varied_rooms, keys_and_touch_drive, survives_restarts, a_dream_goes_on_and_is_saved, a_plan_is_chosen_and_taken]
-    tests += [an_episode_is_played, a_dropped_file_is_imported, it_is_small, it_takes_little_of_the_cpu, it_rests_when_hidden, a_training_is_watched]
+    tests += [an_episode_is_played, a_dropped_file_is_imported, it_is_small, it_takes_little_of_the_cpu, it_rests_when_hidden, a_training_is_watched, a_new_version_is_activated_and_evaluated]
     only = os.environ.get("PAGE_TEST")
     try:
         with sync_playwright() as playwright:

@@ -11,7 +11,7 @@ use metrics::counter;
 use tokio::sync::Mutex;
 use tracing::{info, warn};
 
-use crate::store::{Author, Lease, PublishedVersion, Store, StoreError, unix_s};
+use crate::store::{Author, JobId, Lease, PublishedVersion, Store, StoreError, unix_s};
 use foreframe_core::error_kind::{ErrorKind, HasErrorKind};
 use foreframe_core::error_text;
 use foreframe_core::files::{is_transient, write_atomically};
@@ -54,6 +54,16 @@ pub enum VersionError {
         /// The version.
         version: u32,
     },
+    /// A queued or running job needs it.
+    #[error("version {version} of model \"{model}\" is in use by {job}; wait until that job has ended, or cancel it")]
+    InUse {
+        /// The model's name.
+        model: ModelName,
+        /// The version.
+        version: u32,
+        /// The job's id.
+        job: JobId,
+    },
     /// Its files are not valid. The active version stays active.
     #[error("version {version} of model \"{model}\" is refused: {reason}")]
     Refused {
@@ -82,7 +92,7 @@ impl HasErrorKind for VersionError {
         }
         match self {
             Self::Unknown { .. } => ErrorKind::NotFound,
-            Self::Active { .. } | Self::Shipped { .. } => ErrorKind::Conflict,
+            Self::Active { .. } | Self::Shipped { .. } | Self::InUse { .. } => ErrorKind::Conflict,
             Self::Refused { .. } => ErrorKind::Unusable,
             Self::Registry(error) => error.kind(),
             Self::Store(error) => error.kind(),

@@ -230,10 +230,14 @@ impl Keys {
         self.is_required || self.known.borrow().exist
     }
 
-    /// As [`Keys::check`], with the key that a request presents; counts refusals.
+    /// As [`Keys::check`], with the key that a request presents; counts those without a valid one.
     pub(in crate::server) fn admit(&self, headers: &HeaderMap, needed: KeyScope) -> Result<(Caller, Author), ApiError> {
         let checked = self.check(presented(headers).as_deref(), needed);
-        checked.inspect_err(|_| counter!(metric_names::AUTH_REFUSED).increment(1))
+        checked.inspect_err(|error| {
+            if let ApiError::Unauthorized(_) = error {
+                counter!(metric_names::AUTH_REFUSED).increment(1);
+            }
+        })
     }
 
     /// Who calls, with a key of the needed scope, and the author of what the request changes. Takes the same time for every unknown

@@ -52,7 +52,8 @@ async function checked(response, used) {
 
 async function request(path, options = {}) {
   const used = key;
-  const response = await fetch(path, { ...options, headers: { ...options.headers, ...authorization() } });
+  const response = await fetch(path, { ...options, headers: { ...options.headers, ...authorization() } })
+    .catch(cause => { throw new Error("The server does not answer; try again.", { cause }); });
   return checked(response, used);
 }
 

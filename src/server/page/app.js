@@ -1,6 +1,6 @@
 // The page: its views, the state line, the choice of model and source, and the form for the API key.
 
-import { html, render, useEffect, useMemo, useState } from "./preact.js";
+import { html, render, useEffect, useLayoutEffect, useMemo, useState } from "./preact.js";
 import { go, link, note, read } from "./address.js";
 import { unlock } from "./api.js";
 import { Data } from "./data.js";
@@ -34,6 +34,7 @@ function App() {
   const { view: asked, parameters } = useAddress();
   const view = VIEWS.some(([name]) => name === asked) ? asked : "play";
   useEffect(() => { document.title = `${VIEWS.find(([name]) => name === view)[1]} – Foreframe`; }, [view]);
+  useLayoutEffect(() => scrollTo(0, 0), [view, parameters.set]);
   return html`
     <a class="skip" href="#main" onClick=${event => { event.preventDefault(); document.getElementById("main").focus(); }}>Skip to the view</a>
     <header>
@@ -104,6 +105,7 @@ function WithRobot({ view, lists: { models, datasets, notice }, parameters }) {
         ${!sources.length && html`<option value="">none fits</option>`}
       </select></label>
     </div>
+    ${parameters.model && parameters.model !== model?.name && html`<p class="wrong" role="alert">There is no model “${parameters.model}”.${model && ` This is “${model.name}”.`}</p>`}
     ${robot ? html`<${View} robot=${robot} key=${robot} />` : !source && html`<${NoSource} model=${model} datasets=${datasets} />`}`;
 }
 

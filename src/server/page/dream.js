@@ -117,7 +117,7 @@ export function Dream({ robot }) {
           note=${dream?.is_alone ? (robot.is_drivable ? "a new episode: no comparison" : "does not follow your keys") : note} />
       </div>
       <div>
-        <p class="imagined" role="status">${imagined_s.toFixed(1)} s imagined</p>
+        <p class="imagined">${imagined_s.toFixed(1)} s imagined</p>
         <p><button class="main" onClick=${toggle} disabled=${!dream && robot.status !== "running"}>${dream ? "Open the camera again" : "Cut the camera"} <kbd>Space</kbd></button>
         ${" "}<button onClick=${event => { save(dream, robot); letSpaceCut(event); }} disabled=${!dream || dream.moments.length < 2}>Save GIF</button></p>
         <div class="meter"><p>Novelty ${last?.novelty === undefined ? "" : html`<b class=${shade}>${noveltyWord(last.novelty)}</b>`}</p>

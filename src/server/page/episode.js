@@ -101,7 +101,7 @@ export function Episode({ dataset, number, models, parameters }) {
         </div>
         ${predicted.map(({ wrong }) => wrong && html`<p class="wrong" role="alert">No predictions: ${wrong}</p>`)}
         <${Controls} player=${player} count=${data.frames.length} />
-        <p class="quiet">frame ${at} of ${data.frames.length}, ${(data.times_s[at] ?? 0).toFixed(1)} s${data.frame_count > data.frames.length ? `; the first ${data.frames.length} of ${data.frame_count} frames` : ""}</p>
+        <p class="quiet">frame ${at} (0 to ${data.frames.length - 1}), ${(data.times_s[at] ?? 0).toFixed(1)} s${data.frame_count > data.frames.length ? `; the first ${data.frames.length} of ${data.frame_count} frames` : ""}</p>
       </div>
       <div>
         <${Choice} models=${fitting} model=${model} other=${other} dataset=${dataset} number=${number} />

@@ -1,71 +1,103 @@
 // The form of an import: of a path on the server, or of a file that is dropped or chosen here, which is uploaded first.
 
-import { html, useRef, useState } from "./preact.js";
-import { upload } from "./api.js";
+import { html, useEffect, useState } from "./preact.js";
+import { call, upload } from "./api.js";
 
 const ENDINGS = /\.(zip|tar|tar\.gz|tgz|mcap|db3|npy|npz|mp4|mkv|avi|mov|webm)$/i;
 
 // The fields of a form that are not empty.
 export const filled = form => Object.fromEntries([...new FormData(form)].filter(([, value]) => value !== ""));
-const list = words => words?.split(/[\s,]+/).filter(Boolean);
+const list = words => words.split(/[\s,]+/).filter(Boolean);
 
 // The name as the server takes it, and the data set's name that fits.
 const plain = name => name.replaceAll(/[^A-Za-z0-9._ ()+-]/g, "-").replace(/^[^A-Za-z0-9]+/, "").slice(-110);
 const datasetName = name => name.replace(ENDINGS, "").toLowerCase().replaceAll(/[^a-z0-9]+/g, "-").replaceAll(/^-+|-+$/g, "").slice(0, 64) || "recording";
 
-// `submit` gets the job and resolves to whether the server took it.
-export function Import({ submit }) {
-  const form = useRef(), running = useRef(null);
-  const [source, setSource] = useState("");
-  const [name, setName] = useState("");
-  const [share, setShare] = useState(null);
-  const [wrong, setWrong] = useState("");
+// The form as it is filled in, its upload and its job. It is kept outside of the component, so that an upload goes on while another view
+// is open. `share` is how much of the file was sent; null without an upload.
+let form = { fields: { name: "", source: "", size: "64x64", rate: "", action: "", state: "" }, share: null, stop: null, job_id: null, wrong: "" };
+const listeners = new Set();
+
+function change(changes) {
+  form = { ...form, ...changes };
+  for (const listener of listeners) listener(form);
+}
+const fill = changes => change({ fields: { ...form.fields, ...changes } });
+
+function useForm() {
+  const [known, setKnown] = useState(form);
+  useEffect(() => {
+    listeners.add(setKnown);
+    setKnown(form);
+    return () => listeners.delete(setKnown);
+  }, []);
+  return known;
+}
+
+async function submit({ name, source, size, rate, action, state }) {
+  const spec = { kind: "import", name, source, ...(size && { size }), ...(rate && { rate: +rate }), ...(action && { action: list(action) }), ...(state && { state: list(state) }) };
+  try {
+    const { id } = await call("POST", "/v1/jobs", spec);
+    change({ job_id: id, wrong: "" });
+  } catch (error) {
+    change({ wrong: error.message });
+  }
+}
+
+async function take(files) {
+  const [file] = files;
+  if (!file || form.stop) return;
+  if (files.length > 1 || !ENDINGS.test(file.name)) {
+    change({ wrong: "Drop one file: an archive (.zip, .tar, .tar.gz) of a folder, a bag (.mcap, .db3), an array (.npy, .npz) or a video." });
+    return;
+  }
+  const fields = { ...form.fields, name: form.fields.name || datasetName(file.name) };
+  const { done, stop } = upload(`/v1/uploads?name=${encodeURIComponent(plain(file.name))}`, file, share => change({ share }));
+  change({ fields, stop, share: 0, wrong: "" });
+  try {
+    const { source } = await done;
+    fill({ source });
+    await submit({ ...fields, source });
+  } catch (error) {
+    change({ wrong: error.message });
+  }
+  change({ stop: null, share: null });
+}
+
+// After a success, name and source are emptied for the next import; a failed one can be corrected and submitted again. The server deletes
+// an upload that was imported.
+function useEmptied(jobs) {
+  useEffect(() => {
+    const job = jobs.find(({ id }) => id === form.job_id);
+    if (job?.state !== "succeeded") return;
+    change({ job_id: null });
+    for (const field of ["name", "source"]) if (form.fields[field] === job.spec[field]) fill({ [field]: "" });
+  }, [jobs]);
+}
+
+export function Import({ jobs }) {
+  const { fields, share, stop, wrong } = useForm();
   const [is_over, setOver] = useState(false);
-  const send = async changed => {
-    const { size, rate, action, state, ...fields } = { ...filled(form.current), ...changed };
-    const spec = { kind: "import", ...fields, size, ...(rate && { rate: +rate }), ...(action && { action: list(action) }), ...(state && { state: list(state) }) };
-    // The server deletes an upload with its import.
-    if (await submit(spec) && fields.source.startsWith("upload:")) setSource("");
-  };
-  const take = async files => {
-    const [file] = files;
-    if (!file || running.current) return;
-    if (files.length > 1 || !ENDINGS.test(file.name)) {
-      setWrong("Drop one file: an archive (.zip, .tar, .tar.gz) of a folder, a bag (.mcap, .db3), an array (.npy, .npz) or a video.");
-      return;
-    }
-    const chosen = name || datasetName(file.name);
-    setName(chosen);
-    setWrong("");
-    setShare(0);
-    running.current = upload(`/v1/uploads?name=${encodeURIComponent(plain(file.name))}`, file, setShare);
-    try {
-      const received = await running.current.done;
-      setSource(received.source);
-      await send({ name: chosen, source: received.source });
-    } catch (error) {
-      setWrong(error.message);
-    }
-    running.current = null;
-    setShare(null);
-  };
+  useEmptied(jobs);
   const over = is_now => event => {
     event.preventDefault();
     setOver(is_now);
   };
-  return html`<form class=${`card drop ${is_over ? "over" : ""}`} ref=${form} onSubmit=${event => { event.preventDefault(); send({}); }}
+  const field = name => ({ name, value: fields[name], onInput: event => fill({ [name]: event.target.value }) });
+  return html`<form class=${`card drop ${is_over ? "over" : ""}`} onSubmit=${event => { event.preventDefault(); submit(fields); }}
       onDragOver=${over(true)} onDragLeave=${over(false)} onDrop=${event => { over(false)(event); take(event.dataTransfer.files); }}>
     <h3>Import a recording</h3>
     <div class="form">
-    <label>Name <input name="name" required pattern="[a-z0-9][a-z0-9\\-]*" placeholder="mycar" value=${name} onInput=${event => setName(event.target.value)} /></label>
-    <label>Path in the import folder, or upload <input name="source" required placeholder="drive-1" value=${source} onInput=${event => setSource(event.target.value)} /></label>
-    <label>Size <input name="size" value="64x64" pattern="[0-9]{1,4}x[0-9]{1,4}" /></label>
-    <label>Frames per second <input name="rate" type="number" step="any" min="0.01" placeholder="as recorded" /></label>
-    <label>Actions <input name="action" placeholder="found by name" /></label>
-    <label>States <input name="state" placeholder="found by name" /></label>
-    </div><div class="actions"><button class="main">Import</button></div>
+    <label>Name <input ...${field("name")} required pattern="[a-z0-9][a-z0-9\\-]*" placeholder="mycar" /></label>
+    <label>Path in the import folder, or upload <input ...${field("source")} required placeholder="drive-1" /></label>
+    <label>Size <input ...${field("size")} pattern="[0-9]{1,4}x[0-9]{1,4}" /></label>
+    <label>Frames per second <input ...${field("rate")} type="number" step="any" min="0.01" placeholder="as recorded" /></label>
+    <label>Actions <input ...${field("action")} placeholder="found by name" /></label>
+    <label>States <input ...${field("state")} placeholder="found by name" /></label>
+    </div><p class="quiet">Actions are what the robot was told, states what it measured. Columns of a table are found if their names begin with <code>action</code> or <code>state</code>; write the names of others here.</p>
+    <div class="actions"><button class="main">Import</button></div>
     <p class="files"><label>Or drop a file here, or choose one: it is imported with these settings <input type="file" onChange=${event => { take(event.target.files); event.target.value = ""; }} /></label></p>
-    ${share !== null && html`<div class="sending"><progress aria-label="progress of the upload" max="1" value=${share} /><span class="quiet">${share < 1 ? `uploaded ${(100 * share).toFixed(0)} %` : "the import begins…"}</span>
-      <button type="button" class="small" onClick=${() => running.current?.stop()}>Stop</button></div>`}
+    ${stop && html`<div class="sending"><progress aria-label="progress of the upload" max="1" value=${share} /><span class="quiet">${share < 1 ? `uploaded ${(100 * share).toFixed(0)} %` : "the import begins…"}</span>
+      <button type="button" class="small" onClick=${stop}>Stop</button></div>`}
     <p class="wrong" role="alert">${wrong}</p></form>`;
 }

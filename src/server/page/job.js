@@ -2,9 +2,10 @@
 
 import { html, useEffect, useRef, useState } from "./preact.js";
 import { blob, call, get, listen, text } from "./api.js";
+import { useLists } from "./server_lists.js";
 
 const FINAL = ["succeeded", "failed", "cancelled"];
-const isFinal = job => FINAL.includes(job.state);
+export const isFinal = job => FINAL.includes(job.state);
 // Whether a job trains a model.
 export const isTraining = ({ spec }) => ["train", "adapt"].includes(spec.kind);
 
@@ -15,12 +16,26 @@ const MOST_LINES = 500;
 // Losses are read again after an event, but not more often than this.
 const LOSSES_EVERY_MS = 1000;
 
-// The job as it is now, its log and its losses.
+const UNKNOWN = { job: null, lines: [], losses: [], wrong: "" };
+
+// The job as it is now, its log and its losses; nothing without an id. `again` listens again: the events of a job end with it, and a
+// resumed job has new ones.
 export function useJob(id) {
-  const [known, setKnown] = useState({ job: null, lines: [], losses: [], wrong: "" });
+  const [known, setKnown] = useState(UNKNOWN);
+  const [turn, setTurn] = useState(0);
+  const again = () => setTurn(now => now + 1);
+  const listed = useLists().jobs?.find(job => job.id === id);
+  // Another page may have resumed it.
   useEffect(() => {
-    setKnown({ job: null, lines: [], losses: [], wrong: "" });
-    if (!id) return undefined;
+    if (listed && !isFinal(listed) && known.job && isFinal(known.job)) again();
+  }, [listed?.state, listed?.attempts]);
+  useEffect(() => {
+    if (!id) {
+      setKnown(UNKNOWN);
+      return undefined;
+    }
+    // The log comes from its first line; the rest is shown until it is read again.
+    setKnown(now => ({ ...now, lines: [], wrong: "" }));
     let read_ms = -Infinity, is_gone = false;
     const readLosses = async () => {
       read_ms = performance.now();
@@ -40,8 +55,8 @@ export function useJob(id) {
       is_gone = true;
       stop();
     };
-  }, [id]);
-  return known;
+  }, [id, turn]);
+  return { ...known, again };
 }
 
 export const duration = seconds => (seconds < 90 ? `${Math.ceil(seconds)} s` : seconds < 5400 ? `${Math.round(seconds / 60)} min` : `${(seconds / 3600).toFixed(1)} h`);
@@ -49,7 +64,8 @@ export const duration = seconds => (seconds < 90 ? `${Math.ceil(seconds)} s` : s
 export function Progress({ job }) {
   const { done, total, remaining_s, message } = job.progress;
   const is_running = job.state === "running";
-  const words = [total ? `${done} of ${total}` : "", is_running ? message : job.state, is_running && remaining_s != null ? `${duration(remaining_s)} left` : "",
+  const state = job.state === "queued" ? "waits for its turn" : job.state;
+  const words = [total ? `${done} of ${total}` : "", is_running ? message : state, is_running && remaining_s != null ? `${duration(remaining_s)} left` : "",
     job.losses.train == null ? "" : `loss ${job.losses.train.toPrecision(3)}`].filter(Boolean);
   // Without a value, the bar says that the total is unknown.
   const value = total ? { max: total, value: done } : is_running ? {} : { max: 1, value: 0 };
@@ -57,12 +73,12 @@ export function Progress({ job }) {
     <p class="quiet">${words.join(", ")}${job.cancelling && is_running ? "; stopping" : ""}</p>${job.error && html`<p class="wrong">${job.error}</p>`}</div>`;
 }
 
-// Cancel or resume, whichever fits.
-export function Steer({ job }) {
+// Cancel or resume, whichever fits. `onResume` is called when the job goes on.
+export function Steer({ job, onResume }) {
   const [wrong, setWrong] = useState("");
-  const ask = what => () => call("POST", `/v1/jobs/${job.id}/${what}`).then(() => setWrong(""), error => setWrong(error.message));
+  const ask = (what, then) => () => call("POST", `/v1/jobs/${job.id}/${what}`).then(() => { setWrong(""); then?.(); }, error => setWrong(error.message));
   return html`${!isFinal(job) && !job.cancelling && html`<button class="small" onClick=${ask("cancel")}>Cancel</button>`}
-    ${["failed", "cancelled"].includes(job.state) && html`<button class="small" onClick=${ask("resume")}>Resume</button>`}
+    ${["failed", "cancelled"].includes(job.state) && html`<button class="small" onClick=${ask("resume", onResume)}>Resume</button>`}
     ${wrong && html`<span class="wrong">${wrong}</span>`}`;
 }
 
@@ -134,20 +150,37 @@ function sheet(rules) {
 export function Report({ job }) {
   const files = job.result?.files ?? [];
   const path = file => `/v1/jobs/${job.id}/files/${file}`;
-  return files.includes("report.md") ? html`<${Markdown} path=${path("report.md")} picture=${path} />` : null;
+  return files.includes("report.md") ? html`<div class="actions"><${Download} path=${path("report.md")} name=${`report-${job.id}.md`}>download the report<//>
+    <${Download} path=${path("report.json")} name=${`report-${job.id}.json`}>its numbers as JSON<//></div>
+    <${Markdown} path=${path("report.md")} picture=${path} />` : null;
+}
+
+// Saves a file of the server. A link could not send the key.
+function Download({ path, name, children }) {
+  const [wrong, setWrong] = useState("");
+  const save = async () => {
+    const url = URL.createObjectURL(await blob(path));
+    Object.assign(document.createElement("a"), { href: url, download: name }).click();
+    setTimeout(() => URL.revokeObjectURL(url), 10_000);
+  };
+  return html`<button class="small" onClick=${() => save().then(() => setWrong(""), error => setWrong(error.message))}>${children}</button>
+    ${wrong && html`<span class="wrong">${wrong}</span>`}`;
 }
 
 // What a report in Markdown uses: headings, paragraphs, lists, tables and pictures.
 function Markdown({ path, picture }) {
   const [blocks, setBlocks] = useState([]);
   useEffect(() => {
-    text(path).then(words => setBlocks(words.split(/\n{2,}/)), error => setBlocks([error.message]));
+    text(path).then(words => setBlocks(blocksOf(words)), error => setBlocks([error.message]));
   }, [path]);
   const [summary, ...sections] = sectionsOf(blocks);
   const drawn = some => some.map(block => html`<${Block} text=${block.trim()} picture=${picture} />`);
   return html`<div class="report">${drawn(summary)}${sections.map(([heading, ...rest], place) => html`
     <details open=${place === 0}><summary><${Block} text=${heading.trim()} picture=${picture} /></summary>${drawn(rest)}</details>`)}</div>`;
 }
+
+// The parts between empty lines. A table is a part of its own, also directly after a line of text.
+const blocksOf = words => words.replaceAll(/^([^|\n].*)\n(?=\|)/gm, "$1\n\n").split(/\n{2,}/);
 
 // The blocks before the first heading of the second level, and those of each such heading.
 function sectionsOf(blocks) {
@@ -161,7 +194,7 @@ function sectionsOf(blocks) {
 
 function Block({ text: words, picture }) {
   const heading = words.match(/^(#+) (.*)/);
-  if (heading) return heading[1].length === 1 ? html`<h2>${heading[2]}</h2>` : html`<h3>${heading[2]}</h3>`;
+  if (heading) return heading[1].length === 1 ? html`<h2>${inline(heading[2])}</h2>` : html`<h3>${inline(heading[2])}</h3>`;
   const figure = words.match(/^!\[(.*?)\]\((.*?)\)$/);
   if (figure) return html`<p><${ServerPicture} path=${picture(figure[2])} alt=${figure[1] || figure[2]} /></p>`;
   if (words.startsWith("|")) return html`<${Table} rows=${words.split("\n")} />`;

@@ -52,11 +52,13 @@ export function heldAction(model) {
   return actionFor(model, pull("ahead", "back"), pull("left", "right"));
 }
 
+// A slider needs only its arrows.
+const isTypedInto = ({ key, target: { tagName, type } }) => ["SELECT", "INPUT", "TEXTAREA"].includes(tagName) && (type !== "range" || key.startsWith("Arrow"));
+
 function onKey(event, down) {
   const name = KEYS[event.key.toLowerCase()];
   if (!name || event.ctrlKey || event.metaKey || event.altKey) return;
-  if (["SELECT", "INPUT", "TEXTAREA"].includes(event.target.tagName) && event.target.type !== "range") return;
-  if (down && !listeners.size) return;
+  if (down && (!listeners.size || isTypedInto(event))) return;
   event.preventDefault();
   hold(name, down);
 }

@@ -1,11 +1,13 @@
 // Train: trainings, adaptations and evaluations, their curves and reports, and the models that come of them.
 
-import { html, useEffect, useMemo, useState } from "./preact.js";
+import { html, useEffect, useMemo, useRef, useState } from "./preact.js";
 import { link, note } from "./address.js";
 import { call, get } from "./api.js";
 import { duration, isTraining, Log, Progress, Report, ServerPicture, Steer, titleOf, useJob } from "./job.js";
 import { Models } from "./models.js";
 import { COLORS, Plot } from "./plot.js";
+import { levels } from "./score.js";
+import { readModels } from "./server_lists.js";
 import { Copy, curl, requests } from "./snippets.js";
 
 export function Train({ lists, parameters }) {
@@ -21,7 +23,8 @@ export function Train({ lists, parameters }) {
 
 function Trainings({ models, datasets, jobs, parameters }) {
   const [wrong, setWrong] = useState("");
-  const submit = spec => call("POST", "/v1/jobs", spec).then(job => { note({ job: job.id }); setWrong(""); }, error => setWrong(error.message));
+  const [submitted, setSubmitted] = useState(null);
+  const submit = spec => call("POST", "/v1/jobs", spec).then(job => { note({ job: job.id }); setSubmitted(job.id); setWrong(""); }, error => setWrong(error.message));
   if (!datasets) return html`<p class="quiet wait">Loading…</p>`;
   const chosen = parameters.job ?? jobs.find(isTraining)?.id;
   return html`
@@ -29,7 +32,7 @@ function Trainings({ models, datasets, jobs, parameters }) {
       : html`<div class="empty"><h2>First a data set</h2><p><a href="#data">Collect or import one</a>; then train on it here.</p></div>`}
     <p class="wrong" role="alert">${wrong}</p>
     ${jobs.length > 0 && html`<h2>Jobs</h2><${Jobs} jobs=${jobs} chosen=${chosen} />`}
-    ${chosen && html`<${Watched} id=${chosen} jobs=${jobs} />`}`;
+    ${chosen && html`<${Watched} key=${chosen} id=${chosen} jobs=${jobs} models=${models} is_new=${chosen === submitted} />`}`;
 }
 
 // The presets, from the contract.
@@ -170,23 +173,49 @@ function Jobs({ jobs, chosen }) {
       <td>${titleOf(job.spec)}</td><td class=${STATES[job.state]}>${job.state}</td><td>${job.started_unix_s ? duration((job.ended_unix_s ?? Date.now() / 1000) - job.started_unix_s) : ""}</td></tr>`)}</tbody></table></div>`;
 }
 
-// The chosen job as it goes on.
-function Watched({ id, jobs }) {
-  const { job, lines, losses, wrong } = useJob(id);
-  if (wrong) return html`<p class="wrong" role="alert">${wrong}</p>`;
-  if (!job) return html`<p class="quiet wait">Reading ${id}…</p>`;
-  return html`<div class="watched">
+// The chosen job as it goes on. One that was submitted just now comes into sight.
+function Watched({ id, jobs, models, is_new }) {
+  const { job, lines, losses, wrong, again } = useJob(id);
+  const panel = useRef();
+  useEffect(() => {
+    if (!is_new) return;
+    panel.current.scrollIntoView();
+    panel.current.focus({ preventScroll: true });
+  }, [is_new]);
+  return html`<div class="watched" ref=${panel} tabindex="-1">${wrong ? html`<p class="wrong" role="alert">${wrong}</p>`
+    : !job ? html`<p class="quiet wait">Reading ${id}…</p>`
+    : html`<${Panel} job=${job} lines=${lines} losses=${losses} jobs=${jobs} models=${models} onResume=${again} />`}</div>`;
+}
+
+function Panel({ job, lines, losses, jobs, models, onResume }) {
+  const { id } = job;
+  return html`
     <h2>${id}: ${titleOf(job.spec)} <span class=${STATES[job.state]}>${job.state}</span></h2>
     <${Progress} job=${job} />
-    <div class="actions"><${Steer} job=${job} />
-      ${job.state === "succeeded" && isTraining(job) && html`<a href=${link("play", { model: job.spec.name })}>play it</a>`}
+    ${job.result?.version && isTraining(job) && html`<${Published} result=${job.result} models=${models} />`}
+    <div class="actions"><${Steer} job=${job} onResume=${onResume} />
       ${job.state === "succeeded" && ["collect", "import"].includes(job.spec.kind) && html`<a href=${link("data", { set: job.spec.name })}>open it</a>`}</div>
-    ${isTraining(job) && html`<${Curves} id=${id} losses=${losses} jobs=${jobs} /><${Sample} id=${id} losses=${losses} />`}
+    ${isTraining(job) && html`<${Curves} job=${job} losses=${losses} jobs=${jobs} /><${Sample} id=${id} losses=${losses} />`}
     <${Report} job=${job} />
     <details><summary>Log</summary><${Log} lines=${lines} /></details>
-    <footer><${Copy} curl=${() => curl("GET", `/v1/jobs/${id}/events`, undefined, " -N")} python=${() => requests("GET", `/v1/jobs/${id}`)} /></footer>
-  </div>`;
+    <footer><${Copy} curl=${() => curl("GET", `/v1/jobs/${id}/events`, undefined, " -N")} python=${() => requests("GET", `/v1/jobs/${id}`)} /></footer>`;
 }
+
+// The version that a training published, and what an adaptation gained.
+function Published({ result: { model: name, version, metrics }, models }) {
+  const [wrong, setWrong] = useState("");
+  const model = models.find(one => one.name === name);
+  const has_version = model?.versions.includes(version);
+  const activate = () => call("POST", `/v1/models/${name}/versions/${version}/activate`).then(() => { setWrong(""); return readModels(); }).catch(error => setWrong(error.message));
+  const state = !model ? "it is not loaded yet." : !has_version ? "it was deleted."
+    : model.active_version === version ? html`it is active. <a href=${link("play", { model: name })}>play it</a>`
+    : html`version ${model.active_version} is active and is the one that plays. <button class="small" onClick=${activate}>Activate version ${version}</button>`;
+  return html`<p>Published as version ${version} of ${name}; ${state}</p><p class="wrong" role="alert">${wrong}</p>
+    ${metrics?.adaptation && html`<${Gain} ...${metrics.adaptation} />`}`;
+}
+
+const Gain = ({ before, after, copied, windows }) => html`<p>Error on ${windows} validation windows: <b>${levels(after).toFixed(1)}</b> gray levels,
+  before the adaptation ${levels(before).toFixed(1)}; a copy of the last frame ${levels(copied).toFixed(1)}.</p>`;
 
 // What the network predicts at its latest validation.
 function Sample({ id, losses }) {
@@ -208,7 +237,7 @@ function joined(lines) {
 }
 
 // The curves of a training on a log scale, and those of others over them.
-function Curves({ id, losses, jobs }) {
+function Curves({ job: { id, state }, losses, jobs }) {
   const [others, setOthers] = useState({});
   const trainings = jobs.filter(job => isTraining(job) && job.id !== id).slice(0, 8);
   const toggle = async other => {
@@ -217,12 +246,14 @@ function Curves({ id, losses, jobs }) {
     const { points } = await get(`/v1/jobs/${other}/metrics`);
     return setOthers({ ...rest, [other]: points });
   };
-  const stage = losses.some(point => point.stage === "sequence") ? "sequence" : "pretrain";
+  // Null before the first loss.
+  const stage = losses.at(-1)?.stage ?? null;
   const overlaid = Object.keys(others);
   const data = useMemo(() => joined([lineOf(losses, stage, "train"), lineOf(losses, stage, "validation"), ...overlaid.map(other => lineOf(others[other], stage, "validation"))]), [losses, others, stage]);
   const series = [{ label: "training", color: "--quiet", width: 1 }, { label: "validation", color: "--orange", width: 2, points: true },
     ...overlaid.map((other, place) => ({ label: `validation of ${other}`, color: COLORS[(place + 3) % COLORS.length], width: 2 }))];
-  return html`<h3>Loss, stage ${stage}</h3>
-    ${losses.length ? html`<${Plot} label="loss of the training and the validation windows" data=${data} series=${series} height=${240} x="step" log legend />` : html`<p class="quiet">No loss yet; the first comes after some steps.</p>`}
+  const none = { queued: "No loss yet: the job waits for its turn.", running: "No loss yet; the first comes after some steps." };
+  return html`<h3>Loss${stage ? `, stage ${stage}` : ""}</h3>
+    ${losses.length ? html`<${Plot} label="loss of the training and the validation windows" data=${data} series=${series} height=${240} x="step" log legend />` : html`<p class="quiet">${none[state] ?? "No loss was measured."}</p>`}
     ${trainings.length > 0 && html`<div class="actions" role="group" aria-label="runs over this one">${trainings.map(job => html`<button class="small" aria-pressed=${Boolean(others[job.id])} onClick=${() => toggle(job.id)}>${job.id}, ${job.spec.name}</button>`)}</div>`}`;
 }

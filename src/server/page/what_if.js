@@ -81,7 +81,8 @@ export function WhatIf({ robot }) {
   const note = plans.length ? (robot.status === "reconnecting" ? "reconnecting" : "") : noteOf(robot, robot.history.at(-1)) || "asking the model";
   const is_moving = robot.plan.length > 0;
   // Not `disabled`, which would take the focus away from who presses it by a key.
-  const can_take = plans.length > 0 && !is_moving && robot.is_drivable;
+  const is_away = !robot.source || robot.status === "reconnecting";
+  const can_take = plans.length > 0 && !is_moving && !is_away && robot.is_drivable;
   return html`<section class="what-if">
     <h1 class="visually-hidden">What if</h1>
     <p>Nine ways to drive for the next ${horizon_s} s, each as the model expects the camera to see it. <b>Best</b> is the one that ends with the view that is most like the goal: that picture you choose.</p>
@@ -94,7 +95,7 @@ export function WhatIf({ robot }) {
       <button onClick=${() => setGoal(frame)} disabled=${!frame}>make the present frame the goal</button>
       <button class="main" aria-disabled=${!can_take} onClick=${() => can_take && take(plans[best])}>take the best</button>
       <label><input type="checkbox" checked=${follows} disabled=${!robot.is_drivable} onChange=${event => setFollows(event.target.checked)} /> keep taking the best</label>
-      ${!robot.is_drivable && html`<span class="quiet">A recording cannot take a plan.</span>`}
+      ${is_away ? html`<span class="quiet">${noteOf(robot, robot.history.at(-1))}</span>` : !robot.is_drivable && html`<span class="quiet">A recording cannot take a plan.</span>`}
     </div>
     <p class="wrong" role="alert">${wrong}</p>
     <h2>What the next ${horizon_s} s would look like</h2>

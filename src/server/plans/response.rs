@@ -96,7 +96,7 @@ pub struct PlanResponse {
     /// What stands in the way; absent unless it was asked for and checked.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     obstacles: Option<ObstaclesBody>,
-    /// How unlike the training data frames, state and the plan are, 0…1; absent if the model is not calibrated, or nothing was predicted.
+    /// How unlike the training data frames, state and the plan to follow are, 0…1; absent if the model is not calibrated, or nothing was predicted.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     novelty: Option<f32>,
     /// Plans that were judged.
@@ -156,8 +156,7 @@ impl PlanResponse {
         choice: PlanChoice,
         took: Duration,
     ) -> Result<Self, ApiError> {
-        let mut all = std::iter::once(&choice.best).chain(&choice.runners_up);
-        let novelty = all.find_map(|candidate| candidate.rollout.as_ref()?.novelty);
+        let novelty = choice.best.novelty;
         let others = choice.runners_up.into_iter();
         Ok(Self {
             model: manifest.name.to_string(),

@@ -122,6 +122,7 @@ async fn get(app: App, Path(name): Path<String>) -> Result<axum::Json<DatasetDes
 )]
 async fn delete(app: App, author: Author, Path(name): Path<String>) -> Result<StatusCode, ApiError> {
     let name = dataset_name(&app, &name).await?;
+    let _held = app.jobs().hold_submissions().await;
     let open = app.jobs().open().await?;
     if let Some(job) = open.into_iter().find(|job| job.spec.datasets().contains(&&name)) {
         return Err(JobError::InUse { name, job: job.id }.into());

@@ -81,7 +81,7 @@ impl ServerEventStream {
     /// The name of the next event; none if the key was revoked or the store failed: the client may connect again.
     async fn next(&mut self) -> Option<&'static str> {
         loop {
-            let now = [self.models(), self.jobs().await?];
+            let now = [self.models().await?, self.jobs().await?];
             for (place, name) in ["models", "jobs"].into_iter().enumerate() {
                 if self.sent[place] != Some(now[place]) {
                     self.sent[place] = Some(now[place]);
@@ -96,12 +96,20 @@ impl ServerEventStream {
         }
     }
 
-    fn models(&self) -> u64 {
+    /// A hash of the active versions, of the published ones and of what evaluations measured.
+    async fn models(&self) -> Option<u64> {
+        let store = self.app.store();
         let mut hasher = DefaultHasher::new();
         for manifest in self.app.predictor().models() {
             (manifest.name.as_str(), manifest.version).hash(&mut hasher);
         }
-        hasher.finish()
+        for published in store.published_versions().await.ok()? {
+            (published.model.as_str(), published.version).hash(&mut hasher);
+        }
+        for measured in store.model_metrics().await.ok()? {
+            (measured.model.as_str(), measured.version, measured.metrics).hash(&mut hasher);
+        }
+        Some(hasher.finish())
     }
 
     async fn jobs(&self) -> Option<u64> {

@@ -181,12 +181,22 @@ async fn activate(
     responses(
         (status = 204, description = "Deleted"),
         (status = 404, description = "No such version; the answer lists the versions"),
-        (status = 409, description = "It is active, or was not published by a job"),
+        (status = 409, description = "It is active, was not published by a job, or a job that has not ended needs it"),
     )
 )]
 async fn delete(app: App, author: Author, Path((model, version)): Path<(String, u32)>) -> Result<StatusCode, ApiError> {
     let versions = app.versions();
     let name = model_name(&model, version)?;
+    let _held = app.jobs().hold_submissions().await;
+    let open = app.jobs().open().await?;
+    if let Some(job) = open.into_iter().find(|job| job.needs_version(&name, version)) {
+        return Err(VersionError::InUse {
+            model: name,
+            version,
+            job: job.id,
+        }
+        .into());
+    }
     versions.delete(app.predictor(), &name, version, &author).await?;
     Ok(StatusCode::NO_CONTENT)
 }

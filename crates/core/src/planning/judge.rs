@@ -197,7 +197,14 @@ impl Judge {
         (squares.sum::<f32>() / one.len() as f32).sqrt()
     }
 
-    pub(super) fn candidate(&self, tried: &Tried, has_rollouts: bool) -> PlanCandidate {
+    /// How unlike the training data a plan is, if `others`, of other plans from the same context, tell it where it was not predicted.
+    pub(super) fn novelty(&self, tried: &Tried, others: Option<f32>) -> Option<f32> {
+        let calibration = self.model.manifest.calibration.as_ref();
+        let of_actions = || calibration.map_or(0.0, |known| known.novelty_of_actions(&tried.plan));
+        tried.novelty().or_else(|| Some(others?.max(of_actions())))
+    }
+
+    pub(super) fn candidate(&self, tried: &Tried, has_rollouts: bool, novelty: Option<f32>) -> PlanCandidate {
         let values = self.terms.iter().zip(&tried.values);
         PlanCandidate {
             kind: tried.kind,
@@ -209,6 +216,7 @@ impl Judge {
             motion: tried.motion.clone(),
             clearance_m: tried.clearance_m,
             rollout: tried.rollout.clone(),
+            novelty,
         }
     }
 

@@ -176,12 +176,8 @@ impl Planner {
         let stop = begun.find(|tried| tried.kind == CandidateKind::Stop).cloned();
         let stop = stop.or_else(|| self.judge.fixed_plans().into_iter().next());
         let of_context = self.fixed.iter().find_map(Tried::novelty);
-        let is_unknown = |tried: &Tried| {
-            tried
-                .novelty()
-                .or(of_context)
-                .is_some_and(|novelty| novelty >= NOVELTY_LIMIT)
-        };
+        let novelty = |tried: &Tried| self.judge.novelty(tried, of_context);
+        let is_unknown = |tried: &Tried| novelty(tried).is_some_and(|novelty| novelty >= NOVELTY_LIMIT);
         let all: Vec<&Tried> = self.fixed.iter().chain(&self.drawn).collect();
         // Costs of predicted frames count only if all that are compared have them.
         let has_rollouts =
@@ -205,7 +201,7 @@ impl Planner {
         } else {
             None
         };
-        let candidate = |tried: &Tried| self.judge.candidate(tried, has_rollouts);
+        let candidate = |tried: &Tried| self.judge.candidate(tried, has_rollouts, novelty(tried));
         let stop = stop.map(|tried| candidate(&tried));
         let best = match (unsafe_reason, compared.first(), stop) {
             (None, Some(best), _) | (_, Some(best), None) => candidate(best),

@@ -116,10 +116,21 @@ impl Calibration {
         let at_pose = at_pose.map_or(0.0, |(look, features)| look.distance(context, &features));
         let read = spec.states_that_count().into_iter();
         let of_state = read.filter_map(|channel| Some((self.states.get(channel)?, *state?.get(channel)?)));
-        let of_actions = self.actions.iter().cycle().zip(actions.iter().copied());
-        let excess = of_state.chain(of_actions).map(|(range, value)| range.excess(value));
+        let excess = of_state.map(|(range, value)| range.excess(value));
         let out_of_range = OUT_OF_RANGE * excess.fold(0.0, f64::max);
-        self.novelty.distance(context).max(at_pose).max(out_of_range)
+        let of_frames = self.novelty.distance(context).max(at_pose);
+        of_frames.max(out_of_range).max(self.distance_of_actions(actions))
+    }
+
+    /// The novelty of actions (of any step) alone, 0…1: without what the frames and the state add.
+    #[must_use]
+    pub(crate) fn novelty_of_actions(&self, actions: &[f32]) -> f32 {
+        self.novelty.novelty(self.distance_of_actions(actions))
+    }
+
+    fn distance_of_actions(&self, actions: &[f32]) -> f64 {
+        let ranges = self.actions.iter().cycle().zip(actions);
+        OUT_OF_RANGE * ranges.map(|(range, value)| range.excess(*value)).fold(0.0, f64::max)
     }
 }
 

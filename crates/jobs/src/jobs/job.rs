@@ -5,6 +5,7 @@ use serde::Serialize;
 use super::progress::StoredProgress;
 use super::{JobError, JobProgress, JobSpec, JobState, Losses};
 use crate::store::{JobId, JobIdError, JobPage, JobRow, PartCounts};
+use foreframe_core::types::ModelName;
 
 /// The parts of a job: how many are in which state. The others wait.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, utoipa::ToSchema)]
@@ -62,6 +63,13 @@ pub struct Job {
 }
 
 impl Job {
+    /// Whether it fails if that version of a model is deleted before it ends. A training that has begun has a copy.
+    #[must_use]
+    pub fn needs_version(&self, model: &ModelName, version: u32) -> bool {
+        let has_copy = self.attempts > 0 && matches!(self.spec, JobSpec::Train(_) | JobSpec::Adapt(_));
+        !has_copy && self.spec.used_model() == Some(model) && self.spec.used_version() == Some(version)
+    }
+
     /// Errors: `Record` if the row was written by an incompatible version of the program.
     pub(super) fn of(row: &JobRow) -> Result<Self, JobError> {
         let record = |reason: String| JobError::Record { id: row.id, reason };

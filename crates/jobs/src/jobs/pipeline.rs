@@ -198,7 +198,7 @@ impl Pipeline {
                 "{after}, for which it waited, is {}; resume that one, then this one",
                 row.state
             ))),
-            // Without a row, the job ended long ago.
+            // It is known as long as a job that waited for it has not succeeded.
             _ => Ok(()),
         }
     }

@@ -3,7 +3,8 @@
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Instant;
 
-use tokio::sync::{Notify, watch};
+use metrics::counter;
+use tokio::sync::{Notify, RwLock, RwLockWriteGuard, watch};
 use tokio::task::JoinHandle;
 use tracing::{info, warn};
 
@@ -14,6 +15,7 @@ use super::runner;
 use super::shared::{JobLimits, SharedJobs};
 use super::{Job, JobError, JobFilter, JobSpec, JobState, JobTransition};
 use crate::store::{Author, EnqueueResult, JobId, JobRow, LogRow, LossRow, NewJob, Store};
+use foreframe_core::metric_names;
 
 /// The maximum length of an idempotency key.
 const MAX_KEY_LENGTH: usize = 128;
@@ -33,6 +35,7 @@ impl Jobs {
             store,
             limits,
             execute,
+            in_use: RwLock::new(()),
             wake: Notify::new(),
             ended: Notify::new(),
             stop: watch::Sender::new(false),
@@ -46,7 +49,7 @@ impl Jobs {
         Ok(Self { shared, runner })
     }
 
-    /// Enqueues a job of the API key with the id `submitter`, which is empty without a key. If a job was enqueued with the same
+    /// Enqueues a job of the API key with the id `submitter`, which is empty without a key. If it enqueued a job with the same
     /// idempotency key before, returns that job. Errors: what [`JobExecutor::check`] refuses, `QueueFull`, `ShareFull`, `Taken`,
     /// `Stopping`, `Invalid`, `Store`.
     pub async fn submit(&self, submitter: &str, spec: JobSpec, key: Option<String>) -> Result<Job, JobError> {
@@ -56,6 +59,17 @@ impl Jobs {
         }
         if let Some(key) = &key {
             check_key(key)?;
+        }
+        // Two clients may choose the same key.
+        let key = key.map(|key| {
+            if submitter.is_empty() {
+                key
+            } else {
+                format!("{submitter}:{key}")
+            }
+        });
+        let _checked = shared.in_use.read().await;
+        if let Some(key) = &key {
             if let Some(row) = shared.store.job_of_key(key).await? {
                 return same(&row, &spec);
             }
@@ -93,6 +107,11 @@ impl Jobs {
             ),
             _ => JobError::QueueFull(self.shared.limits.queued),
         }
+    }
+
+    /// Until the guard is dropped, this process queues no job: what no open job uses can be deleted.
+    pub async fn hold_submissions(&self) -> RwLockWriteGuard<'_, ()> {
+        self.shared.in_use.write().await
     }
 
     /// Jobs, the newest first. Errors: `Invalid`, `Record`, `Store`.
@@ -137,6 +156,10 @@ impl Jobs {
                 Some(_) => store.cancel_queued(row.id, store.now_s().await?, by).await?,
             };
             if asked {
+                if state != JobState::Running {
+                    let outcome = JobState::Cancelled.name();
+                    counter!(metric_names::JOBS_ENDED, "kind" => row.kind, "outcome" => outcome).increment(1);
+                }
                 let job = self.get(id).await;
                 self.shared.forget_oldest().await;
                 return job;

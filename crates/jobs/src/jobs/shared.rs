@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use tokio::sync::{Notify, watch};
+use tokio::sync::{Notify, RwLock, watch};
 use tracing::warn;
 
 use super::executor::JobExecutor;
@@ -34,6 +34,8 @@ pub(super) struct SharedJobs {
     pub(super) store: Store,
     pub(super) limits: JobLimits,
     pub(super) execute: Arc<dyn JobExecutor>,
+    /// Held while a job is checked and queued, and alone while something is deleted that a job could use.
+    pub(super) in_use: RwLock<()>,
     /// A job may be waiting.
     pub(super) wake: Notify,
     /// A job has ended in this process.

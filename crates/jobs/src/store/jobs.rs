@@ -127,17 +127,19 @@ impl Store {
         Ok(row.map(EnqueueResult::New))
     }
 
-    /// Deletes all ended jobs except the latest `keep`, with their parts; returns the ids of all. Errors: `Query`.
+    /// Deletes all ended jobs except the latest `keep`, with their parts; returns the ids of all. A job stays as long as one that waited
+    /// for it has not succeeded, since that one asks how it ended. Errors: `Query`.
     pub async fn forget_ended(&self, keep: i64) -> Result<Vec<JobId>, StoreError> {
         let mut tx = self.database.begin().await?;
         // No job is resumed meanwhile.
         tx.lock_numbers().await?;
         let sql = "WITH old AS (SELECT number FROM jobs WHERE state IN ('succeeded', 'failed', 'cancelled') \
              AND parent IS NULL ORDER BY ended_s DESC, number DESC LIMIT 1000000 OFFSET $1), \
-             busy AS (SELECT parent FROM jobs WHERE parent IS NOT NULL AND state IN ('queued', 'running')) \
+             busy AS (SELECT parent AS number FROM jobs WHERE parent IS NOT NULL AND state IN ('queued', 'running') \
+             UNION SELECT after_job FROM jobs WHERE after_job IS NOT NULL AND state <> 'succeeded') \
              DELETE FROM jobs WHERE state IN ('succeeded', 'failed', 'cancelled') \
              AND (number IN (SELECT number FROM old) OR parent IN (SELECT number FROM old)) \
-             AND COALESCE(parent, number) NOT IN (SELECT parent FROM busy) RETURNING number";
+             AND COALESCE(parent, number) NOT IN (SELECT number FROM busy) RETURNING number";
         let rows = tx.fetch(sql, values![keep]).await?;
         let forgotten = rows.iter().map(id_of).collect::<Result<_, _>>()?;
         tx.commit().await?;

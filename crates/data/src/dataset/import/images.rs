@@ -56,6 +56,7 @@ fn csv_file(folder: &Path, options: &ImportOptions) -> Result<Option<PathBuf>, I
 }
 
 fn without_csv(folder: &Path, options: &ImportOptions) -> Result<Recording, ImportError> {
+    options.names_no_values("a folder of images without a CSV file")?;
     let mut paths = entries(folder)?;
     paths.retain(|path| ["png", "jpg", "jpeg"].contains(&extension(path).as_str()));
     if paths.is_empty() {

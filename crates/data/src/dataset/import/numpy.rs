@@ -26,6 +26,7 @@ pub(super) struct ArrayHeader {
 
 /// Reads the header of an array. Errors: `Option` (no rate), `Io`, `Record`.
 pub(super) fn open(path: &Path, options: &ImportOptions) -> Result<Recording, ImportError> {
+    options.names_no_values("an .npy file")?;
     let Some(rate) = options.rate_hz else {
         return Err(ImportError::Option(format!(
             "{} has no timestamps; give the frames per second with --rate",

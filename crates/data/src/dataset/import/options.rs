@@ -140,6 +140,23 @@ pub fn parse_size(text: &str) -> Result<FrameSize, &'static str> {
 }
 
 impl ImportOptions {
+    /// Errors: `Option` if an option names values that a source of frames alone cannot have.
+    pub(super) fn names_no_values(&self, source: &str) -> Result<(), ImportError> {
+        let named = [
+            ("--csv", self.csv.is_some()),
+            ("--image", self.image.is_some()),
+            ("--time", self.time.is_some()),
+            ("--action", !self.actions.is_empty()),
+            ("--state", !self.states.is_empty()),
+        ];
+        match named.iter().find(|(_, is_given)| *is_given) {
+            None => Ok(()),
+            Some((option, _)) => Err(ImportError::Option(format!(
+                "{source} holds frames alone, so there is nothing that {option} can name"
+            ))),
+        }
+    }
+
     /// Checks what can be checked without the source. Errors: `OptionValue`.
     pub fn validate(&self) -> Result<(), ImportError> {
         let (width, height) = (self.frame_width_px, self.frame_height_px);

@@ -29,6 +29,7 @@ pub(super) fn open(video: &Path, options: &ImportOptions, cancelled: &AtomicBool
                 .to_owned(),
         ));
     }
+    options.names_no_values("a video")?;
     let ListedFrames { times_s, damage } = frames_of(video, cancelled)?;
     let mut skipped = SkippedList::default();
     damage.map_or(Ok(()), |damage| damage.leave_out(options.skip_bad, &mut skipped))?;

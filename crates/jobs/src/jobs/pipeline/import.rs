@@ -1,6 +1,7 @@
 //! The work of an import. A part of one saves its shards in `runs/JOB`, from where the whole takes them. What a part did not save
 //! is imported by the whole.
 
+use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
 use super::super::datasets;
@@ -32,9 +33,16 @@ impl Pipeline {
         };
         let retry = self.retry_policy(report, cancelled);
         retry.run(async || upload.fetch(objects).await)?;
+        let place = upload.existing(objects.data_dir());
         let result = self.import_here(spec, report, cancelled);
         upload.forget_copy(objects);
-        result
+        result.map_err(|failure| match (failure, place.as_deref().map(Path::parent)) {
+            // Who uploaded the file knows it by its name, not by where it lies here.
+            (JobFailure::Failed(reason), Ok(Some(dir))) => {
+                JobFailure::Failed(reason.replace(&format!("{}/", dir.display()), ""))
+            }
+            (failure, _) => failure,
+        })
     }
 
     /// Imports what is on this machine.
