@@ -280,7 +280,7 @@ fn a_plan_out_of_the_training_is_not_chosen_though_it_was_not_predicted() {
             choice.runners_up.iter().all(|other| other.novelty > Some(0.99)),
             "{choice:?}"
         );
-        assert!(choice.best.novelty < Some(0.95), "{choice:?}");
+        assert!(choice.best.novelty < Some(0.98), "{:?}", choice.best.novelty);
     }
 }
 

@@ -105,7 +105,7 @@ function WithRobot({ view, lists: { models, datasets, notice }, parameters }) {
         ${!sources.length && html`<option value="">none fits</option>`}
       </select></label>
     </div>
-    ${parameters.model && parameters.model !== model?.name && html`<p class="wrong" role="alert">There is no model “${parameters.model}”.${model && ` This is “${model.name}”.`}</p>`}
+    ${parameters.model && parameters.model !== model?.name && html`<p class="wrong" role="alert">There is no model “${parameters.model}”.${model && ` “${model.name}” is shown instead.`}</p>`}
     ${robot ? html`<${View} robot=${robot} key=${robot} />` : !source && html`<${NoSource} model=${model} datasets=${datasets} />`}`;
 }
 

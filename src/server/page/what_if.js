@@ -9,7 +9,7 @@ import { noteOf } from "./play.js";
 import { useMoments } from "./robot.js";
 import { contextBody, decode } from "./predict.js";
 import { levels } from "./score.js";
-import { takesActions } from "./server_lists.js";
+import { takesActions, useLists } from "./server_lists.js";
 import { Copy, curl, requests } from "./snippets.js";
 
 // Name, how much ahead, how much left, color.
@@ -45,6 +45,7 @@ async function compareAll(robot, context) {
 
 export function WhatIf({ robot }) {
   useMoments(robot);
+  const { connection } = useLists();
   const [goal, setGoal] = useState(null);
   const [plans, setPlans] = useState([]);
   const [follows, setFollows] = useState(false);
@@ -81,7 +82,8 @@ export function WhatIf({ robot }) {
   const note = plans.length ? (robot.status === "reconnecting" ? "reconnecting" : "") : noteOf(robot, robot.history.at(-1)) || "asking the model";
   const is_moving = robot.plan.length > 0;
   // Not `disabled`, which would take the focus away from who presses it by a key.
-  const is_away = !robot.source || robot.status === "reconnecting";
+  // A robot that stands asks nothing of the server, so only the events tell that it is away.
+  const is_away = !robot.source || robot.status === "reconnecting" || ["reconnecting", "stopping"].includes(connection);
   const can_take = plans.length > 0 && !is_moving && !is_away && robot.is_drivable;
   return html`<section class="what-if">
     <h1 class="visually-hidden">What if</h1>
@@ -95,7 +97,7 @@ export function WhatIf({ robot }) {
       <button onClick=${() => setGoal(frame)} disabled=${!frame}>make the present frame the goal</button>
       <button class="main" aria-disabled=${!can_take} onClick=${() => can_take && take(plans[best])}>take the best</button>
       <label><input type="checkbox" checked=${follows} disabled=${!robot.is_drivable} onChange=${event => setFollows(event.target.checked)} /> keep taking the best</label>
-      ${is_away ? html`<span class="quiet">${noteOf(robot, robot.history.at(-1))}</span>` : !robot.is_drivable && html`<span class="quiet">A recording cannot take a plan.</span>`}
+      ${is_away ? html`<span class="quiet">${noteOf(robot, robot.history.at(-1)) || "reconnecting"}</span>` : !robot.is_drivable && html`<span class="quiet">A recording cannot take a plan.</span>`}
     </div>
     <p class="wrong" role="alert">${wrong}</p>
     <h2>What the next ${horizon_s} s would look like</h2>
