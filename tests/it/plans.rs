@@ -143,6 +143,11 @@ async fn bad_goals_and_budgets_are_refused_with_the_field() {
             "goal.position_m[0] is 2000; it must be -1000 to 1000",
         ),
         (
+            json!({"position_m": [1.0, 2.0, 3.0]}),
+            json!({}),
+            "goal.position_m has too many entries",
+        ),
+        (
             ahead(),
             json!({"budget_ms": 0}),
             "budget_ms is 0; it must be 1 to 10000",

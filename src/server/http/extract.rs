@@ -130,9 +130,21 @@ impl From<JsonRejection> for ApiError {
                 Self::Unprocessable(error.source().map_or_else(|| error.body_text(), ToString::to_string))
             }
             JsonRejection::BytesRejection(error) => error.into(),
+            JsonRejection::JsonSyntaxError(error) => {
+                match error.source().and_then(|error| too_long_list(&error.to_string())) {
+                    Some(detail) => Self::Unprocessable(detail),
+                    None => Self::Malformed(error.body_text()),
+                }
+            }
             other => Self::Malformed(other.body_text()),
         }
     }
+}
+
+/// What is wrong with valid JSON in which a list of fixed length is too long: serde calls that a mistake of syntax within the field.
+fn too_long_list(error: &str) -> Option<String> {
+    let (field, _) = error.split_once(": trailing characters")?;
+    Some(format!("{field} has too many entries"))
 }
 
 impl From<BytesRejection> for ApiError {
