@@ -273,10 +273,11 @@ impl Header<'_> {
         if names.is_empty() {
             return Vec::new();
         }
+        let csv = self.csv.file_name().unwrap_or(self.csv.as_os_str());
         vec![format!(
             "columns of {} that were not imported: {}; to import one, name it as a component of the action (what the robot was \
              told) with --action COLUMN, or of the state (what it measured) with --state COLUMN",
-            self.csv.display(),
+            csv.display(),
             listed(names.iter().map(|name| name.escape_debug().to_string()))
         )]
     }
