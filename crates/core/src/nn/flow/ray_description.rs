@@ -38,7 +38,7 @@ impl RoomViews {
             rest = later;
             let from = self.seen_from(view);
             layers.run(of_view, RAY_VALUES, |first, read| {
-                describe_rays(view, from, sides, first, read)
+                describe_rays(view, from, sides, first, read);
             });
         }
         seen

@@ -182,7 +182,9 @@ impl Scene {
                 };
                 if let Some(layers) = PackedPerceptron::of(&self.layers) {
                     let mut seen = views.described_to(&layers, RoomSides::of(&self.learned)?);
-                    seen.iter_mut().for_each(|value| *value += MIDDLE_GRAY as f32);
+                    for value in &mut seen {
+                        *value += MIDDLE_GRAY as f32;
+                    }
                     return Ok(Tensor::from_vec(seen, shape, &Device::Cpu)?);
                 }
                 let seen = perceptron(&self.layers, &views.describe(&self.learned)?)?;
