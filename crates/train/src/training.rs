@@ -123,13 +123,8 @@ pub fn run(
             validation_loss: point.validation_loss,
         });
     }
-    // Most networks have no pre-training.
-    let stage = match state.progress.stage {
-        TrainingStage::Pretrain if config.pretrain.steps == 0 => TrainingStage::Sequence,
-        stage => stage,
-    };
     observer.on_event(TrainingEvent::Started {
-        stage,
+        stage: with_steps(state.progress.stage, config),
         step: state.progress.step,
         windows: plan.train.len(),
     });
@@ -169,6 +164,14 @@ pub fn run(
     write_atomically(&history_file, &history).map_err(io_failed("write", &history_file))?;
     let manifest = Box::new(registry::publish(&model_dir, &state.parameters, &manifest)?);
     Ok(TrainingOutcome::Finished { model_dir, manifest })
+}
+
+/// The stage, or the next one if it has no steps: most networks have no pre-training.
+fn with_steps(stage: TrainingStage, config: &TrainConfig) -> TrainingStage {
+    match stage {
+        TrainingStage::Pretrain if config.pretrain.steps == 0 => TrainingStage::Sequence,
+        stage => stage,
+    }
 }
 
 /// The weights to start from; `None` if cancelled.
