@@ -69,10 +69,10 @@ impl Jobs {
             }
         });
         let _checked = shared.in_use.read().await;
-        if let Some(key) = &key {
-            if let Some(row) = shared.store.job_of_key(key).await? {
-                return same(&row, &spec);
-            }
+        if let Some(key) = &key
+            && let Some(row) = shared.store.job_of_key(key).await?
+        {
+            return same(&row, &spec);
         }
         let checked = shared.execute.check(&spec).await?;
         let new = NewJob {
