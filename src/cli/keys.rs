@@ -138,8 +138,14 @@ async fn revoke(store: &Store, wanted: &str) -> Result<(), CliError> {
     let now_s = store.now_s().await?;
     let mut valid = store.list_keys().await?;
     valid.retain(|key| key.is_valid(now_s));
-    let is_wanted = |key: &&KeyRow| key.id == wanted || key.name == wanted;
-    let found: Vec<&str> = valid.iter().filter(is_wanted).map(|key| &*key.id).collect();
+    let with = |is_wanted: fn(&KeyRow, &str) -> bool| -> Vec<&str> {
+        let found = valid.iter().filter(|key| is_wanted(key, wanted));
+        found.map(|key| &*key.id).collect()
+    };
+    let found = match with(|key, id| key.id == id) {
+        none if none.is_empty() => with(|key, name| key.name == name),
+        found => found,
+    };
     let id = match found[..] {
         [id] => id,
         [] => {

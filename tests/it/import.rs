@@ -418,10 +418,7 @@ fn options_that_name_values_are_refused_where_there_are_frames_alone() {
                 ..options
             };
             let error = run(source, &dir.path().join("out"), options).unwrap_err().to_string();
-            assert_eq!(
-                error,
-                format!("{what} holds frames alone, so there is nothing that {option} can name")
-            );
+            assert_eq!(error, format!("{what} has only frames; leave out {option}"));
         }
     }
 }

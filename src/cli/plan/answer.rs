@@ -73,7 +73,7 @@ pub(super) fn print_choice(manifest: &Manifest, choice: &PlanChoice) -> Result<(
         print_line(if sees_depth {
             "the way was not checked: the model's actions are not speeds (m/s and rad/s)"
         } else {
-            "the way was not checked: the model estimates no depth, as \"rooms\" does"
+            "the way was not checked: this model does not estimate depth (\"rooms\" does)"
         })?;
     }
     print_line(format!(

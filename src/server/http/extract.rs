@@ -141,10 +141,12 @@ impl From<JsonRejection> for ApiError {
     }
 }
 
-/// What is wrong with valid JSON in which a list of fixed length is too long: serde calls that a mistake of syntax within the field.
+/// What is wrong if a list of fixed length goes on after its last entry: serde calls that a mistake of syntax within the field.
 fn too_long_list(error: &str) -> Option<String> {
     let (field, _) = error.split_once(": trailing characters")?;
-    Some(format!("{field} has too many entries"))
+    Some(format!(
+        "{field} has too many entries, or a comma or bracket is missing"
+    ))
 }
 
 impl From<BytesRejection> for ApiError {

@@ -84,11 +84,17 @@ function Making({ jobs }) {
   return [...open, ...ended].map(job => html`<${Follow} key=${job.id} listed=${job} is_followed=${followed.includes(job)} />`);
 }
 
+// Of the notes of a job, so many are shown.
+const MOST_NOTES = 5;
+
 function Follow({ listed, is_followed }) {
   const { job: followed, lines, again } = useJob(is_followed ? listed.id : null);
   const job = followed ?? listed;
+  const notes = lines.map(({ line }) => line).filter(isNote);
+  const more = notes.length - MOST_NOTES;
   return html`<div class="card making"><h3>${titleOf(job.spec)}</h3><${Progress} job=${job} />
-    ${lines.map(({ line }) => line).filter(isNote).map(line => html`<p class="care">${line}</p>`)}
+    ${notes.slice(0, MOST_NOTES).map(line => html`<p class="care">${line}</p>`)}
+    ${more > 0 && html`<p class="care">and ${more} more; the job's log in Train has all</p>`}
     <div class="actions"><${Steer} job=${job} onResume=${again} />
     ${job.state === "succeeded" && html`<a href=${link("data", { set: job.spec.name })}>open it</a>`}</div></div>`;
 }

@@ -51,13 +51,14 @@ async function take(files) {
     change({ wrong: "Drop one file: an archive (.zip, .tar, .tar.gz) of a folder, a bag (.mcap, .db3), an array (.npy, .npz) or a video." });
     return;
   }
-  const fields = { ...form.fields, name: form.fields.name || datasetName(file.name) };
   const { done, stop } = upload(`/v1/uploads?name=${encodeURIComponent(plain(file.name))}`, file, share => change({ share }));
-  change({ fields, stop, share: 0, wrong: "" });
+  change({ stop, share: 0, wrong: "" });
+  fill({ name: form.fields.name || datasetName(file.name) });
   try {
     const { source } = await done;
-    fill({ source });
-    await submit({ ...fields, source });
+    // Other fields may have been changed meanwhile.
+    fill({ source, name: form.fields.name || datasetName(file.name) });
+    await submit(form.fields);
   } catch (error) {
     change({ wrong: error.message });
   }

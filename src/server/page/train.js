@@ -207,7 +207,8 @@ function Published({ result: { model: name, version, metrics }, models }) {
   const model = models.find(one => one.name === name);
   const has_version = model?.versions.includes(version);
   const activate = () => call("POST", `/v1/models/${name}/versions/${version}/activate`).then(() => { setWrong(""); return readModels(); }).catch(error => setWrong(error.message));
-  const state = !model ? "it is not loaded yet." : !has_version ? "it was deleted."
+  const is_coming = !model || version > Math.max(...model.versions);
+  const state = is_coming ? "it is not loaded yet." : !has_version ? "it was deleted."
     : model.active_version === version ? html`it is active. <a href=${link("play", { model: name })}>play it</a>`
     : html`version ${model.active_version} is active and is the one that plays. <button class="small" onClick=${activate}>Activate version ${version}</button>`;
   return html`<p>Published as version ${version} of ${name}; ${state}</p><p class="wrong" role="alert">${wrong}</p>

@@ -69,11 +69,13 @@ export function WhatIf({ robot }) {
   const costs = plans.map(({ frames }) => (goal ? mse(frames.at(-1), goal) : 0));
   const best = costs.indexOf(Math.min(...costs));
   const take = plan => robot.carryOut(plan.actions);
+  // A robot that stands asks nothing of the server, so only the events tell that it is away.
+  const is_away = !robot.source || robot.status === "reconnecting" || ["reconnecting", "stopping"].includes(connection);
   useEffect(() => {
-    if (!follows || !plans.length || !robot.is_drivable) return undefined;
+    if (!follows || !plans.length || !robot.is_drivable || is_away) return undefined;
     const soon = setTimeout(() => take(plans[best]), 1200);
     return () => clearTimeout(soon);
-  }, [follows, plans]);
+  }, [follows, plans, is_away]);
   const step = useAnimation(robot);
   const horizon_s = (robot.spec.horizon * robot.spec.frame_period_s).toFixed(1);
   if (!takesActions(robot.model)) {
@@ -82,8 +84,6 @@ export function WhatIf({ robot }) {
   const note = plans.length ? (robot.status === "reconnecting" ? "reconnecting" : "") : noteOf(robot, robot.history.at(-1)) || "asking the model";
   const is_moving = robot.plan.length > 0;
   // Not `disabled`, which would take the focus away from who presses it by a key.
-  // A robot that stands asks nothing of the server, so only the events tell that it is away.
-  const is_away = !robot.source || robot.status === "reconnecting" || ["reconnecting", "stopping"].includes(connection);
   const can_take = plans.length > 0 && !is_moving && !is_away && robot.is_drivable;
   return html`<section class="what-if">
     <h1 class="visually-hidden">What if</h1>

@@ -40,8 +40,8 @@ pub struct PlanCandidate {
     pub clearance_m: Option<f32>,
     /// What the camera is predicted to show; `None` if there was no time to predict it.
     pub rollout: Option<Rollout>,
-    /// How unlike the training data frames, state and actions are, 0…1. Without a prediction, it is that of the frames and the state, or of
-    /// the actions alone, whichever is higher; `None` if the model is not calibrated, or nothing was predicted.
+    /// How unlike the training data frames, state and actions are, 0…1. Without a prediction, it is the novelty of stopping, which was
+    /// predicted, or that of the plan's own actions, whichever is higher; `None` if the model is not calibrated, or nothing was predicted.
     pub novelty: Option<f32>,
 }
 

@@ -63,10 +63,10 @@ pub struct Job {
 }
 
 impl Job {
-    /// Whether it fails if that version of a model is deleted before it ends. A training that has begun has a copy.
+    /// Whether it fails if that version of a model is deleted before it ends. A training that has made a step has a copy.
     #[must_use]
     pub fn needs_version(&self, model: &ModelName, version: u32) -> bool {
-        let has_copy = self.attempts > 0 && matches!(self.spec, JobSpec::Train(_) | JobSpec::Adapt(_));
+        let has_copy = self.progress.done > 0 && matches!(self.spec, JobSpec::Train(_) | JobSpec::Adapt(_));
         !has_copy && self.spec.used_model() == Some(model) && self.spec.used_version() == Some(version)
     }
 

@@ -198,7 +198,7 @@ impl Pipeline {
                 "{after}, for which it waited, is {}; resume that one, then this one",
                 row.state
             ))),
-            // It is known as long as a job that waited for it has not succeeded.
+            // It has succeeded. (If not, its row stays until this job has succeeded.)
             _ => Ok(()),
         }
     }

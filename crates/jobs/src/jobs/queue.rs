@@ -35,7 +35,7 @@ impl Jobs {
             store,
             limits,
             execute,
-            in_use: RwLock::new(()),
+            submissions: RwLock::new(()),
             wake: Notify::new(),
             ended: Notify::new(),
             stop: watch::Sender::new(false),
@@ -68,12 +68,14 @@ impl Jobs {
                 format!("{submitter}:{key}")
             }
         });
-        let _checked = shared.in_use.read().await;
         if let Some(key) = &key
             && let Some(row) = shared.store.job_of_key(key).await?
         {
             return same(&row, &spec);
         }
+        // Fetches an uploaded file, which may take long, before a deletion has to wait.
+        shared.execute.check_again(&spec).await?;
+        let _submitting = shared.submissions.read().await;
         let checked = shared.execute.check(&spec).await?;
         let new = NewJob {
             kind: checked.kind().to_owned(),
@@ -111,7 +113,7 @@ impl Jobs {
 
     /// Until the guard is dropped, this process queues no job: what no open job uses can be deleted.
     pub async fn hold_submissions(&self) -> RwLockWriteGuard<'_, ()> {
-        self.shared.in_use.write().await
+        self.shared.submissions.write().await
     }
 
     /// Jobs, the newest first. Errors: `Invalid`, `Record`, `Store`.
@@ -174,6 +176,7 @@ impl Jobs {
         if self.shared.is_stopping() {
             return Err(JobError::Stopping);
         }
+        let _submitting = self.shared.submissions.read().await;
         let row = self.row(id).await?;
         let job = Job::of(&row)?;
         if job.state.after(JobTransition::Resume).is_none() {

@@ -34,8 +34,8 @@ pub(super) struct SharedJobs {
     pub(super) store: Store,
     pub(super) limits: JobLimits,
     pub(super) execute: Arc<dyn JobExecutor>,
-    /// Held while a job is checked and queued, and alone while something is deleted that a job could use.
-    pub(super) in_use: RwLock<()>,
+    /// Locked for reading while a job is checked and queued, for writing while a data set or a version is deleted that a job could use.
+    pub(super) submissions: RwLock<()>,
     /// A job may be waiting.
     pub(super) wake: Notify,
     /// A job has ended in this process.

@@ -182,34 +182,63 @@ mod tests {
     use crate::frame::warp::CameraModel;
     use crate::nn::flow::room_geometry::RoomScale;
     use crate::nn::geometry::camera::CameraPose;
-    use crate::nn::gradient_check::assert_gradients;
+    use crate::nn::gradient_check::{assert_gradients, noise, values};
+    use crate::nn::ops::linear::Linear;
+    use crate::nn::ops::modulation::perceptron;
     use crate::nn::ops::sampling::ImageSize;
+    use crate::nn::precision::Precision;
 
-    const CAMERA: CameraModel = CameraModel {
-        horizontal_fov_rad: 1.0,
-        tilt_down_rad: 0.2,
-        height_m: Some(0.3),
-    };
-
-    fn views(poses: &[CameraPose]) -> RoomViews {
-        let size = ImageSize { height: 4, width: 6 };
-        RoomViews {
-            scale: RoomScale {
-                middle: [2.0, 0.5],
-                unit: 0.8,
-            },
-            views: ViewInRoom::of(poses, &vec![CAMERA; poses.len()], CAMERA, size),
-        }
-    }
-
-    #[test]
-    fn gradients_of_the_sides_agree_with_differences() {
+    /// From three poses.
+    fn views(size: ImageSize) -> RoomViews {
+        let camera = CameraModel {
+            horizontal_fov_rad: 1.0,
+            tilt_down_rad: 0.2,
+            height_m: Some(0.3),
+        };
         let poses = [0.3, 2.0, -1.2].map(|heading| CameraPose {
             x: 2.3,
             y: 0.2,
             heading,
         });
-        let parameter = Tensor::new(&[0.02f32, -0.03, 0.01, 0.05, 0.04, -0.02], &candle_core::Device::Cpu).unwrap();
-        assert_gradients(&[parameter], 2e-4, |inputs| views(&poses).describe(&inputs[0]));
+        RoomViews {
+            scale: RoomScale {
+                middle: [2.0, 0.5],
+                unit: 0.8,
+            },
+            views: ViewInRoom::of(&poses, &[camera; 3], camera, size),
+        }
+    }
+
+    fn sides() -> Tensor {
+        Tensor::new(&[0.02f32, -0.03, 0.01, 0.05, 0.04, -0.02], &candle_core::Device::Cpu).unwrap()
+    }
+
+    #[test]
+    fn gradients_of_the_sides_agree_with_differences() {
+        let size = ImageSize { height: 4, width: 6 };
+        assert_gradients(&[sides()], 2e-4, |inputs| views(size).describe(&inputs[0]));
+    }
+
+    #[test]
+    fn packed_layers_give_what_the_tensors_give() {
+        // Whole groups of rays, and some more.
+        let views = views(ImageSize { height: 7, width: 15 });
+        let layer = |inputs: usize, outputs: usize, seed| Linear {
+            weight: (noise(&[inputs, outputs], seed) * 0.2).unwrap(),
+            bias: noise(&[outputs], seed + 1),
+            has_tanh: false,
+            packed: None,
+        };
+        let mut layers = [layer(RAY_VALUES, 24, 1), layer(24, 12, 3)];
+        let plain = values(&perceptron(&layers, &views.clone().describe(&sides()).unwrap()).unwrap());
+        for layer in &mut layers {
+            layer.pack(Precision::F32).unwrap();
+        }
+        let packed = PackedPerceptron::of(&layers).unwrap();
+        let packed = views.described_to(&packed, RoomSides::of(&sides()).unwrap());
+        assert_eq!(plain.len(), packed.len());
+        for (plain, packed) in plain.iter().zip(packed) {
+            assert!((plain - packed).abs() < 1e-4, "{plain} and {packed}");
+        }
     }
 }

@@ -112,13 +112,20 @@ impl ViewInRoom {
         learned_by: CameraModel,
         size: ImageSize,
     ) -> Vec<Self> {
-        let views = poses.iter().zip(cameras);
-        let views = views.map(|(&pose, &camera)| Self {
-            pose,
-            above: above(camera, learned_by),
-            camera: ViewerRays::of(Viewer::new(camera, size)),
-        });
-        views.collect()
+        let mut views: Vec<Self> = Vec::with_capacity(poses.len());
+        for (index, (&pose, &camera)) in poses.iter().zip(cameras).enumerate() {
+            // The rays of large frames are not kept, so views share them.
+            let before = index.checked_sub(1).filter(|&before| cameras[before] == camera);
+            views.push(Self {
+                pose,
+                above: above(camera, learned_by),
+                camera: before.map_or_else(
+                    || ViewerRays::of(Viewer::new(camera, size)),
+                    |before| views[before].camera.clone(),
+                ),
+            });
+        }
+        views
     }
 }
 

@@ -152,7 +152,7 @@ impl ImportOptions {
         match named.iter().find(|(_, is_given)| *is_given) {
             None => Ok(()),
             Some((option, _)) => Err(ImportError::Option(format!(
-                "{source} holds frames alone, so there is nothing that {option} can name"
+                "{source} has only frames; leave out {option}"
             ))),
         }
     }

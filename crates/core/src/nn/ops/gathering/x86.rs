@@ -121,7 +121,7 @@ pub(super) fn write_rows<const VALUES: usize>(
                 *row = values.as_chunks::<LANES>().0[part];
             }
             // SAFETY: the machine has the instructions.
-            let square = unsafe { turned(&square) };
+            let square = unsafe { transposed(&square) };
             for (row, values) in rows.iter_mut().zip(square) {
                 row.as_chunks_mut::<LANES>().0[block] = values;
             }
@@ -129,18 +129,18 @@ pub(super) fn write_rows<const VALUES: usize>(
     }
 }
 
-/// Rows as columns.
+/// Transposes a block of 16×16 values.
 #[target_feature(enable = "avx512f")]
 #[inline]
-fn turned(rows: &[[f32; LANES]; LANES]) -> [[f32; LANES]; LANES] {
+fn transposed(rows: &[[f32; LANES]; LANES]) -> [[f32; LANES]; LANES] {
     let mut vectors = [_mm512_setzero_ps(); LANES];
     for row in 0..LANES {
         vectors[row] = floats(rows[row]);
     }
-    exchange::<8>(&mut vectors);
-    exchange::<4>(&mut vectors);
-    exchange::<2>(&mut vectors);
-    exchange::<1>(&mut vectors);
+    swap_blocks::<8>(&mut vectors);
+    swap_blocks::<4>(&mut vectors);
+    swap_blocks::<2>(&mut vectors);
+    swap_blocks::<1>(&mut vectors);
     let mut columns = [[0.0; LANES]; LANES];
     for row in 0..LANES {
         columns[row] = values(vectors[row]);
@@ -148,12 +148,12 @@ fn turned(rows: &[[f32; LANES]; LANES]) -> [[f32; LANES]; LANES] {
     columns
 }
 
-/// Blocks of two rows that are so far apart change places.
+/// Of each square of twice as many lanes and rows, swaps the upper right and the lower left block.
 #[target_feature(enable = "avx512f")]
 #[inline]
-fn exchange<const APART: usize>(vectors: &mut [__m512; LANES]) {
-    let upper = indices(const { exchanged(APART, false) });
-    let lower = indices(const { exchanged(APART, true) });
+fn swap_blocks<const APART: usize>(vectors: &mut [__m512; LANES]) {
+    let upper = indices(const { swapped(APART, false) });
+    let lower = indices(const { swapped(APART, true) });
     for row in 0..LANES {
         if row & APART == 0 {
             let (above, below) = (vectors[row], vectors[row + APART]);
@@ -163,9 +163,9 @@ fn exchange<const APART: usize>(vectors: &mut [__m512; LANES]) {
     }
 }
 
-/// Where each lane of a row comes from, after blocks of so many lanes changed places with the row that is as far below: lanes of the
-/// upper row, then those of the lower one.
-const fn exchanged(apart: usize, is_lower: bool) -> [i32; LANES] {
+/// Where each lane of the upper or lower row comes from after blocks of so many lanes were swapped between two rows that are as far
+/// apart: 0 to 15 are the lanes of the upper row, the others those of the lower one.
+const fn swapped(apart: usize, is_lower: bool) -> [i32; LANES] {
     let mut from = [0; LANES];
     let mut lane = 0;
     while lane < LANES {
