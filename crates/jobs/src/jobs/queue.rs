@@ -73,8 +73,8 @@ impl Jobs {
         {
             return same(&row, &spec);
         }
-        // Fetches an uploaded file, which may take long, before a deletion has to wait.
-        shared.execute.check_again(&spec).await?;
+        // Fetches an uploaded file, which may take long, before a deletion has to wait. What is wrong with it, the next check says.
+        shared.execute.check_again(&spec).await.ok();
         let _submitting = shared.submissions.read().await;
         let checked = shared.execute.check(&spec).await?;
         let new = NewJob {
