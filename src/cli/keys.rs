@@ -138,14 +138,11 @@ async fn revoke(store: &Store, wanted: &str) -> Result<(), CliError> {
     let now_s = store.now_s().await?;
     let mut valid = store.list_keys().await?;
     valid.retain(|key| key.is_valid(now_s));
-    let with = |is_wanted: fn(&KeyRow, &str) -> bool| -> Vec<&str> {
-        let found = valid.iter().filter(|key| is_wanted(key, wanted));
-        found.map(|key| &*key.id).collect()
+    let named: Vec<&KeyRow> = match valid.iter().find(|key| key.id == wanted) {
+        Some(key) => vec![key],
+        None => valid.iter().filter(|key| key.name == wanted).collect(),
     };
-    let found = match with(|key, id| key.id == id) {
-        none if none.is_empty() => with(|key, name| key.name == name),
-        found => found,
-    };
+    let found: Vec<&str> = named.iter().map(|key| &*key.id).collect();
     let id = match found[..] {
         [id] => id,
         [] => {

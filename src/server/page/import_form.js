@@ -2,6 +2,7 @@
 
 import { html, useEffect, useState } from "./preact.js";
 import { call, upload } from "./api.js";
+import { shared } from "./shared.js";
 
 const ENDINGS = /\.(zip|tar|tar\.gz|tgz|mcap|db3|npy|npz|mp4|mkv|avi|mov|webm)$/i;
 
@@ -15,24 +16,8 @@ const datasetName = name => name.replace(ENDINGS, "").toLowerCase().replaceAll(/
 
 // The form as it is filled in, its upload and its job. It is kept outside of the component, so that an upload goes on while another view
 // is open. `share` is how much of the file was sent; null without an upload.
-let form = { fields: { name: "", source: "", size: "64x64", rate: "", action: "", state: "" }, share: null, stop: null, job_id: null, wrong: "" };
-const listeners = new Set();
-
-function change(changes) {
-  form = { ...form, ...changes };
-  for (const listener of listeners) listener(form);
-}
-const fill = changes => change({ fields: { ...form.fields, ...changes } });
-
-function useForm() {
-  const [known, setKnown] = useState(form);
-  useEffect(() => {
-    listeners.add(setKnown);
-    setKnown(form);
-    return () => listeners.delete(setKnown);
-  }, []);
-  return known;
-}
+const { now, change, use: useForm } = shared({ fields: { name: "", source: "", size: "64x64", rate: "", action: "", state: "" }, share: null, stop: null, job_id: null, wrong: "" });
+const fill = changes => change({ fields: { ...now().fields, ...changes } });
 
 async function submit({ name, source, size, rate, action, state }) {
   const spec = { kind: "import", name, source, ...(size && { size }), ...(rate && { rate: +rate }), ...(action && { action: list(action) }), ...(state && { state: list(state) }) };
@@ -46,19 +31,19 @@ async function submit({ name, source, size, rate, action, state }) {
 
 async function take(files) {
   const [file] = files;
-  if (!file || form.stop) return;
+  if (!file || now().stop) return;
   if (files.length > 1 || !ENDINGS.test(file.name)) {
     change({ wrong: "Drop one file: an archive (.zip, .tar, .tar.gz) of a folder, a bag (.mcap, .db3), an array (.npy, .npz) or a video." });
     return;
   }
   const { done, stop } = upload(`/v1/uploads?name=${encodeURIComponent(plain(file.name))}`, file, share => change({ share }));
   change({ stop, share: 0, wrong: "" });
-  fill({ name: form.fields.name || datasetName(file.name) });
+  fill({ name: now().fields.name || datasetName(file.name) });
   try {
     const { source } = await done;
     // Other fields may have been changed meanwhile.
-    fill({ source, name: form.fields.name || datasetName(file.name) });
-    await submit(form.fields);
+    fill({ source, name: now().fields.name || datasetName(file.name) });
+    await submit(now().fields);
   } catch (error) {
     change({ wrong: error.message });
   }
@@ -69,10 +54,10 @@ async function take(files) {
 // an upload that was imported.
 function useEmptied(jobs) {
   useEffect(() => {
-    const job = jobs.find(({ id }) => id === form.job_id);
+    const job = jobs.find(({ id }) => id === now().job_id);
     if (job?.state !== "succeeded") return;
     change({ job_id: null });
-    for (const field of ["name", "source"]) if (form.fields[field] === job.spec[field]) fill({ [field]: "" });
+    for (const field of ["name", "source"]) if (now().fields[field] === job.spec[field]) fill({ [field]: "" });
   }, [jobs]);
 }
 

@@ -2,25 +2,11 @@
 
 import { useEffect, useState } from "./preact.js";
 import { ApiError, all, get, listen, onLocked } from "./api.js";
+import { shared } from "./shared.js";
 
 // connection: connecting, connected, reconnecting, stopping or locked. A list is null until it is known.
-let lists = { connection: "connecting", locked: null, models: null, notice: null, datasets: null, jobs: null, may_use_jobs: true };
-const listeners = new Set();
-
-function change(changes) {
-  lists = { ...lists, ...changes };
-  for (const listener of listeners) listener(lists);
-}
-
-export function useLists() {
-  const [known, setKnown] = useState(lists);
-  useEffect(() => {
-    listeners.add(setKnown);
-    setKnown(lists);
-    return () => listeners.delete(setKnown);
-  }, []);
-  return known;
-}
+const { change, use: useLists } = shared({ connection: "connecting", locked: null, models: null, notice: null, datasets: null, jobs: null, may_use_jobs: true });
+export { useLists };
 
 // The best first: by the skill on test data; models without a score last.
 const bySkill = (one, other) => (skillOf(other) ?? -9) - (skillOf(one) ?? -9) || one.name.localeCompare(other.name);

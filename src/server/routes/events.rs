@@ -38,8 +38,8 @@ struct ServerEvent {
 }
 
 /// Sends an event when the list of models, their versions, the active ones or their scores changed (`event: models`), when the state of a
-/// job changed or a new one came, or a data set was deleted by this server (`event: jobs`), and when the server stops (`event: stopping`). Both lists are announced once at the
-/// beginning. The events do not hold the change: read the list. The stream also ends if the API key is revoked.
+/// job changed or a new one came, or a data set was deleted by this server (`event: jobs`), and when the server stops (`event:
+/// stopping`). Both lists are announced once at the beginning. The events do not hold the change: read the list. The stream also ends if the API key is revoked.
 #[utoipa::path(
     get, path = "/v1/events",
     responses(

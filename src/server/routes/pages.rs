@@ -28,7 +28,7 @@ macro_rules! page_files {
     };
 }
 
-const PAGE_FILES: [(&str, &str); 30] = page_files![
+const PAGE_FILES: [(&str, &str); 31] = page_files![
     "address.js",
     "api.js",
     "app.js",
@@ -51,6 +51,7 @@ const PAGE_FILES: [(&str, &str); 30] = page_files![
     "robot.js",
     "score.js",
     "server_lists.js",
+    "shared.js",
     "snippets.js",
     "sources.js",
     "stream.js",

@@ -12,10 +12,10 @@
 //! The form with `depth` estimates how deep the last frame is, and `reprojection` says where the moved camera saw each of its pixels. It
 //! remembers nothing, unless it has a `memory` of one room.
 //!
-//! Reading order: `room_geometry` and `ray_description` → `encoder_views` and `rollout_rows` (what the network reads) → `scene` and `motion`, or
-//! `depth_views`, `reprojection`, `depth_head`, `speed_head`, `mover_head`, `memory` and `occupancy` → `layers` (its tensors) → `network` →
-//! `direct`, `recurrent` and `depth` (its three forms) → `predict` → `beyond_horizon`. `plain` has the same in candle's own tensor
-//! operations.
+//! Reading order: `room_geometry` and `ray_description` → `encoder_views` and `rollout_rows` (what the network reads) → `scene` and
+//! `motion`, or `depth_views`, `reprojection`, `depth_head`, `speed_head`, `mover_head`, `memory` and `occupancy` → `layers` (its tensors)
+//! → `network` → `direct`, `recurrent` and `depth` (its three forms) → `predict` → `beyond_horizon`. `plain` has the same in candle's own
+//! tensor operations.
 
 mod beyond_horizon;
 mod blocks;

@@ -32,12 +32,9 @@ impl RoomViews {
     pub(super) fn described_to(&self, layers: &PackedPerceptron, sides: RoomSides) -> Vec<f32> {
         let outputs = layers.outputs();
         let mut seen = vec![0.0; self.rays() * outputs];
-        let mut rest = seen.as_mut_slice();
-        for view in &self.views {
-            let (of_view, later) = rest.split_at_mut(view.camera.rays.len() * outputs);
-            rest = later;
+        for (view, seen) in self.parts(&mut seen, outputs) {
             let from = self.seen_from(view);
-            layers.run(of_view, RAY_VALUES, |first, read| {
+            layers.run(seen, RAY_VALUES, |first, read| {
                 describe_rays(view, from, sides, first, read);
             });
         }
@@ -122,11 +119,8 @@ impl FusedOperation<1> for RoomViews {
     fn forward(&self, [parameter]: [Operand; 1]) -> Result<(Vec<f32>, Shape)> {
         let sides = RoomSides::learned(parameter.values);
         let mut out = vec![0.0; self.rays() * RAY_VALUES];
-        let mut rest = out.as_mut_slice();
-        for view in &self.views {
-            let (of_view, later) = rest.split_at_mut(view.camera.rays.len() * RAY_VALUES);
-            rest = later;
-            describe_rays(view, self.seen_from(view), sides, 0, of_view);
+        for (view, out) in self.parts(&mut out, RAY_VALUES) {
+            describe_rays(view, self.seen_from(view), sides, 0, out);
         }
         Ok((out, Shape::from((self.rays(), RAY_VALUES))))
     }

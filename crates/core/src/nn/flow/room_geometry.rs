@@ -200,13 +200,23 @@ impl RoomViews {
         }
     }
 
+    /// Each view with its part of `out`, which has so many values of each ray.
+    pub(super) fn parts<'a>(
+        &'a self,
+        mut out: &'a mut [f32],
+        of_ray: usize,
+    ) -> impl Iterator<Item = (&'a ViewInRoom, &'a mut [f32])> {
+        self.views.iter().map(move |view| {
+            let (part, later) = std::mem::take(&mut out).split_at_mut(of_ray * view.camera.rays.len());
+            out = later;
+            (view, part)
+        })
+    }
+
     /// Where each view's pixels were seen from the pose of the same index in `before`: `[views, rays, 2]`.
     pub(super) fn places_before(&self, sides: RoomSides, viewer: Viewer, before: &[CameraPose]) -> Vec<f32> {
         let mut places = vec![0.0; 2 * self.rays()];
-        let mut rest = places.as_mut_slice();
-        for (view, before) in self.views.iter().zip(before) {
-            let (places, later) = rest.split_at_mut(2 * view.camera.rays.len());
-            rest = later;
+        for ((view, places), before) in self.parts(&mut places, 2).zip(before) {
             let (now, before) = (self.seen_from(view), self.at(*before, view.above));
             vectorized(
                 #[inline(always)]

@@ -12,23 +12,22 @@ use crate::vectorized::Instructions;
 pub(in crate::nn) fn sin_cos(x: f32, instructions: Instructions) -> (f32, f32) {
     /// 1.5 · 2^23: after adding it, the low bits hold the nearest whole number.
     const ROUND: f32 = 12_582_912.0;
-    let add = instructions;
-    let shifted = add.multiply_add(x, FRAC_2_PI, ROUND);
+    let shifted = instructions.multiply_add(x, FRAC_2_PI, ROUND);
     let (turns, quarter) = (shifted - ROUND, shifted.to_bits());
     // A quarter turn in three parts, of which the first two have few digits, so that their multiples are exact.
-    let rest = add.multiply_add(turns, -1.570_312_5, x);
-    let rest = add.multiply_add(turns, -4.837_513e-4, rest);
-    let rest = add.multiply_add(turns, -7.549_79e-8, rest);
+    let rest = instructions.multiply_add(turns, -1.570_312_5, x);
+    let rest = instructions.multiply_add(turns, -4.837_513e-4, rest);
+    let rest = instructions.multiply_add(turns, -7.549_79e-8, rest);
     // A little more than an eighth of a turn: rounding may choose the other neighbour.
     let rest = rest.clamp(-FRAC_PI_4 - 1e-3, FRAC_PI_4 + 1e-3);
     // The polynomials of Cephes' `sinf` and `cosf`.
     let square = rest * rest;
-    let mut sin = add.multiply_add(square, -1.951_529_6e-4, 8.332_161e-3);
-    sin = add.multiply_add(square, sin, -0.166_666_55);
-    sin = add.multiply_add(square * rest, sin, rest);
-    let mut cos = add.multiply_add(square, 2.443_315_7e-5, -1.388_731_6e-3);
-    cos = add.multiply_add(square, cos, 4.166_664_6e-2);
-    cos = add.multiply_add(square * square, cos, add.multiply_add(square, -0.5, 1.0));
+    let mut sin = instructions.multiply_add(square, -1.951_529_6e-4, 8.332_161e-3);
+    sin = instructions.multiply_add(square, sin, -0.166_666_55);
+    sin = instructions.multiply_add(square * rest, sin, rest);
+    let mut cos = instructions.multiply_add(square, 2.443_315_7e-5, -1.388_731_6e-3);
+    cos = instructions.multiply_add(square, cos, 4.166_664_6e-2);
+    cos = instructions.multiply_add(square * square, cos, instructions.multiply_add(square, -0.5, 1.0));
     let (sin, cos) = if quarter & 1 == 0 { (sin, cos) } else { (cos, sin) };
     let signed = |value: f32, negative: u32| f32::from_bits(value.to_bits() ^ negative << 31);
     (
