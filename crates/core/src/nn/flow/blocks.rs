@@ -8,6 +8,7 @@ use crate::nn::ops::compose::{SCENE_CHANNELS, SCENE_FEATURES};
 use crate::nn::ops::gathering::SAMPLED_TOGETHER;
 use crate::nn::ops::pixel_shuffle::pixel_shuffle;
 use crate::nn::ops::sampling::{ImageSize, PixelPlaces, SampledImage};
+use crate::nn::recycled::buffer;
 use crate::vectorized::{vectorized, vectorized_by};
 
 /// Channels of the moved pixels that the fine layers read: a 2×2 block and the share inside the frame.
@@ -66,7 +67,7 @@ pub(super) fn sampled_blocks<'a>(
     size: ImageSize,
 ) -> Result<Tensor> {
     let (half, pixels) = (size.shrunk(2), size.pixels());
-    let mut out = vec![0.0; frame_of.len() * half.pixels() * MOVED_CHANNELS];
+    let mut out = buffer(frame_of.len() * half.pixels() * MOVED_CHANNELS);
     let outs = out.chunks_exact_mut(half.pixels() * MOVED_CHANNELS);
     for ((out, places), &frame) in outs.zip(items).zip(frame_of) {
         write_blocks(&frames[frame as usize * pixels..][..pixels], size, places, out, 0);
@@ -79,7 +80,7 @@ pub(super) fn sampled_blocks<'a>(
     )
 }
 
-/// Adds the share of each block that lies inside the frame to its last channel.
+/// Writes the share of each block that lies inside the frame to its last channel.
 fn write_shares_inside(size: ImageSize, places: PixelPlaces, out: &mut [f32]) {
     let (last_x, last_y) = ((size.width - 1) as f32, (size.height - 1) as f32);
     let row_of_blocks = size.width / 2 * MOVED_CHANNELS;
@@ -96,7 +97,8 @@ fn write_shares_inside(size: ImageSize, places: PixelPlaces, out: &mut [f32]) {
                         shares[at] = if is_inside { 0.25 } else { 0.0 };
                     }
                     for (out, pair) in out.chunks_exact_mut(MOVED_CHANNELS).zip(shares.as_chunks::<2>().0) {
-                        out[MOVED_CHANNELS - 1] += pair[0] + pair[1];
+                        let above = if row % 2 == 0 { 0.0 } else { out[MOVED_CHANNELS - 1] };
+                        out[MOVED_CHANNELS - 1] = above + pair[0] + pair[1];
                     }
                 }
             }

@@ -73,9 +73,10 @@ impl FlowNetwork {
             room: geometry.room.map_or(RoomPlaces::Turned, RoomPlaces::Known),
         };
         let frames = composition.compose(&head, &scene, &geometry.turned)?;
-        self.recycle([&warped, &mixed, &state, &fine, &head])?;
         let content = || Ok::<_, NnError>(content_frames(&scene)?.reshape(shape)?);
         let content = (!ahead.rows.only_frames).then(content).transpose()?;
+        drop(features);
+        self.recycle([&warped, &mixed, &moved, &scene, &state, &fine, &head])?;
         Ok(PredictedAhead {
             frames: frames.reshape(shape)?,
             scene: content,

@@ -127,8 +127,11 @@ impl FlowNetwork {
         for convolution in convolutions.chain(blocks) {
             convolution.pack(precision)?;
         }
-        for linear in self.modulation.iter_mut().chain([&mut self.mix, &mut self.enlarge]) {
+        for linear in &mut self.modulation {
             linear.pack(precision.at_least_bf16())?;
+        }
+        for linear in [&mut self.mix, &mut self.enlarge] {
+            linear.pack(precision.of_convolutions())?;
         }
         self.motion.pack(precision)?;
         if let Some(movers) = &mut self.movers {

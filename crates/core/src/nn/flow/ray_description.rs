@@ -11,6 +11,7 @@ use crate::nn::fused::{FusedOperation, Operand, apply};
 use crate::nn::ops::gathering::{OfPlaces, SAMPLED_TOGETHER, write_rows};
 use crate::nn::ops::modulation::PackedPerceptron;
 use crate::nn::ops::waves::sin_cos;
+use crate::nn::recycled::buffer;
 use crate::vectorized::{Instructions, vectorized_by};
 
 /// Octaves of sines and cosines of each coordinate of the point met.
@@ -31,7 +32,7 @@ impl RoomViews {
     /// What the layers make of each ray's description, `[views · rays, outputs]`.
     pub(super) fn described_to(&self, layers: &PackedPerceptron, sides: RoomSides) -> Vec<f32> {
         let outputs = layers.outputs();
-        let mut seen = vec![0.0; self.rays() * outputs];
+        let mut seen = buffer(self.rays() * outputs);
         for (view, seen) in self.parts(&mut seen, outputs) {
             let from = self.seen_from(view);
             layers.run(seen, RAY_VALUES, |first, read| {
@@ -47,24 +48,25 @@ fn describe_rays(view: &ViewInRoom, from: SeenFrom, sides: RoomSides, first: usi
     vectorized_by(
         #[inline(always)]
         |instructions| {
+            let mut values = [[0.0; SAMPLED_TOGETHER]; RAY_VALUES];
             for (part, out) in out.chunks_mut(SAMPLED_TOGETHER * RAY_VALUES).enumerate() {
                 let rays = view.camera.together(first + part * SAMPLED_TOGETHER);
-                let values = describe_together(rays, from, sides, instructions);
+                describe_together(rays, from, sides, &mut values, instructions);
                 write_rows(&values, out.as_chunks_mut().0, instructions);
             }
         },
     );
 }
 
-/// The descriptions of neighbouring rays, by value.
+/// Writes the descriptions of neighbouring rays, by value.
 #[inline(always)]
 fn describe_together(
     rays: [&OfPlaces; 3],
     from: SeenFrom,
     sides: RoomSides,
+    values: &mut [OfPlaces; RAY_VALUES],
     instructions: Instructions,
-) -> [OfPlaces; RAY_VALUES] {
-    let mut values = [[0.0; SAMPLED_TOGETHER]; RAY_VALUES];
+) {
     for at in 0..SAMPLED_TOGETHER {
         let ray = from.ray([rays[0][at], rays[1][at], rays[2][at]]);
         let hit = sides.hit(ray);
@@ -85,7 +87,6 @@ fn describe_together(
             values[WAVES + SIDES + value][at] = rest[value];
         }
     }
-    values
 }
 
 /// The point met, the ray and the distance.

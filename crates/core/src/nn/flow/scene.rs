@@ -112,8 +112,12 @@ impl Scene {
 
     /// Packs the layers' weights for prediction.
     pub(super) fn pack(&mut self, precision: Precision) -> Result<(), NnError> {
+        let precision = match self.kind {
+            SceneKind::Room(..) => precision.of_convolutions(),
+            SceneKind::Places | SceneKind::Image => precision.at_least_bf16(),
+        };
         for layer in &mut self.layers {
-            layer.pack(precision.at_least_bf16())?;
+            layer.pack(precision)?;
         }
         Ok(())
     }

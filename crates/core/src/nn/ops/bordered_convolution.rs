@@ -8,7 +8,7 @@ use rayon::prelude::*;
 
 use super::byte_convolution::{ByteConvolution, ByteKernel};
 use super::image_geometry::{ImageGeometry, TAPS};
-use super::modulation::activate;
+use super::modulation::{activate, activate_roughly};
 use super::packed::{PackedWeights, PlaceInputs, StartSums, TapRun};
 use super::scratch::with_buffers;
 use super::winograd::{PatchWeights, TileSize, TiledConvolution};
@@ -81,25 +81,34 @@ pub(super) enum Written<'a> {
 }
 
 impl Written<'_> {
-    /// Writes neighbouring places `[places, channels]`.
+    /// Writes neighbouring places `[places, channels]`, activated exactly or roughly.
     #[inline(always)]
-    fn write(self, from: &[f32], to: &mut [f32], channels: usize, instructions: Instructions) {
+    fn write<const ROUGHLY: bool>(self, from: &[f32], to: &mut [f32], channels: usize, instructions: Instructions) {
         match self {
             Written::Plain => to.copy_from_slice(from),
             Written::Silu => {
                 for (to, &from) in to.iter_mut().zip(from) {
-                    *to = activate(from, instructions);
+                    *to = activated::<ROUGHLY>(from, instructions);
                 }
             }
             Written::Modulated(modulation) => {
                 let (scale, shift) = modulation.split_at(channels);
                 for (to, from) in to.chunks_exact_mut(channels).zip(from.chunks_exact(channels)) {
                     for (((to, from), scale), shift) in to.iter_mut().zip(from).zip(scale).zip(shift) {
-                        *to = activate(instructions.multiply_add(*from, 1.0 + scale, *shift), instructions);
+                        *to = activated::<ROUGHLY>(instructions.multiply_add(*from, 1.0 + scale, *shift), instructions);
                     }
                 }
             }
         }
+    }
+}
+
+#[inline(always)]
+fn activated<const ROUGHLY: bool>(x: f32, instructions: Instructions) -> f32 {
+    if ROUGHLY {
+        activate_roughly(x, instructions)
+    } else {
+        activate(x, instructions)
     }
 }
 
@@ -167,7 +176,7 @@ impl<'a> BorderedConvolution<'a> {
             return with_buffers([x.len(), 0, 0], |[activated, ..]| {
                 vectorized_by(
                     #[inline(always)]
-                    |instructions| written.write(x, activated, self.strip.channels, instructions),
+                    |instructions| written.write::<true>(x, activated, self.strip.channels, instructions),
                 );
                 bytes.forward(activated, out, start);
             });
@@ -248,7 +257,7 @@ impl<'a> BorderedConvolution<'a> {
                     let (to, right) = to.split_at_mut(length);
                     left.fill(0.0);
                     right.fill(0.0);
-                    written.write(from, to, channels, instructions);
+                    written.write::<false>(from, to, channels, instructions);
                 }
             },
         );

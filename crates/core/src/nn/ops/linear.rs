@@ -12,6 +12,7 @@ use super::activation::tanh;
 use super::row_weights::RowWeights;
 use crate::nn::fused::{FusedOperation, Operand, apply};
 use crate::nn::precision::Precision;
+use crate::nn::recycled::buffer;
 use crate::nn::tensors::{add_columns, product, slice, sum_columns, with_values};
 use crate::vectorized::vectorized;
 
@@ -63,7 +64,18 @@ fn tanh_all(values: &mut [f32]) {
 
 /// The layer at each place of a grid `[M, h, w, D]`.
 pub(in crate::nn) fn per_place(layer: &Linear, x: &Tensor) -> Result<Tensor> {
-    let (items, height, width, _) = x.dims4()?;
+    let (items, height, width, inputs) = x.dims4()?;
+    if let Some(packed) = layer.packed.as_ref().filter(|_| !layer.has_tanh) {
+        let (places, outputs) = (height * width, packed.outputs());
+        let mut out = buffer(items * places * outputs);
+        with_values(x, |x| {
+            let items = x
+                .chunks_exact(places * inputs)
+                .zip(out.chunks_exact_mut(places * outputs));
+            items.for_each(|(x, out)| packed.multiply_alike(x, out));
+        })?;
+        return Tensor::from_vec(out, (items, height, width, outputs), x.device());
+    }
     layer.forward(&x.flatten(0, 2)?)?.reshape((items, height, width, ()))
 }
 

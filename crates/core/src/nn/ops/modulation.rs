@@ -5,9 +5,10 @@
 use candle_core::{Result, Shape, Tensor, bail};
 use candle_nn::Module as _;
 
-use super::activation::sigmoid_with;
+use super::activation::{rough_sigmoid, sigmoid_with};
 use super::linear::Linear;
 use super::row_weights::RowWeights;
+use super::scratch::with_buffers;
 use crate::nn::fused::{FusedOperation, Operand, apply};
 use crate::nn::recycled::buffer;
 use crate::nn::tensors::with_values;
@@ -62,23 +63,32 @@ impl<'a> PackedPerceptron<'a> {
     pub(in crate::nn) fn run(&self, out: &mut [f32], inputs: usize, mut read: impl FnMut(usize, &mut [f32])) {
         let outputs = self.outputs();
         let widest = self.0.iter().map(|layer| layer.outputs()).fold(inputs, usize::max);
-        let mut buffers = [0, 1].map(|_| vec![0.0; ROWS_TOGETHER * widest]);
-        for (index, out) in out.chunks_mut(ROWS_TOGETHER * outputs).enumerate() {
-            let rows = out.len() / outputs;
-            let [from, to] = &mut buffers;
-            let mut length = rows * inputs;
-            read(index * ROWS_TOGETHER, &mut from[..length]);
-            for (layer, weights) in self.0.iter().enumerate() {
-                if layer + 1 == self.0.len() {
-                    weights.multiply_rows(&from[..length], out);
-                    break;
-                }
-                let sums = &mut to[..rows * weights.outputs()];
-                weights.multiply_rows(&from[..length], sums);
-                activate_all(sums);
-                length = sums.len();
-                std::mem::swap(from, to);
+        let length = ROWS_TOGETHER * widest;
+        with_buffers([length, length, 0], |[from, to, _]| {
+            for (index, out) in out.chunks_mut(ROWS_TOGETHER * outputs).enumerate() {
+                let length = out.len() / outputs * inputs;
+                read(index * ROWS_TOGETHER, &mut from[..length]);
+                self.run_together([&mut *from, &mut *to], length, out);
             }
+        });
+    }
+
+    /// Of rows that are the first `length` values of the first buffer.
+    fn run_together(&self, [mut from, mut to]: [&mut [f32]; 2], mut length: usize, out: &mut [f32]) {
+        let rows = out.len() / self.outputs();
+        let mut layers = self.0.iter().peekable();
+        while let Some(weights) = layers.next() {
+            let Some(next) = layers.peek() else {
+                return weights.multiply_alike(&from[..length], out);
+            };
+            let sums = &mut to[..rows * weights.outputs()];
+            weights.multiply_alike(&from[..length], sums);
+            match next {
+                RowWeights::Single(_) => activate_all(sums),
+                RowWeights::Reduced(_) => activate_all_roughly(sums),
+            }
+            length = sums.len();
+            std::mem::swap(&mut from, &mut to);
         }
     }
 }
@@ -95,6 +105,18 @@ pub(super) fn activate_all(values: &mut [f32]) {
     );
 }
 
+/// The same, rounded as what is reduced to 16 or 8 bits may be.
+fn activate_all_roughly(values: &mut [f32]) {
+    vectorized_by(
+        #[inline(always)]
+        |instructions| {
+            for value in values {
+                *value = activate_roughly(*value, instructions);
+            }
+        },
+    );
+}
+
 /// SiLU(x · (1 + scale) + shift) of x `[N, …, C]`, with `modulation` `[N, 2 · C]`: the scales of an item, then its shifts.
 /// Errors: shapes that do not fit.
 pub(in crate::nn) fn modulated_silu(x: &Tensor, modulation: &Tensor) -> Result<Tensor> {
@@ -104,6 +126,12 @@ pub(in crate::nn) fn modulated_silu(x: &Tensor, modulation: &Tensor) -> Result<T
 #[inline(always)]
 pub(super) fn activate(x: f32, instructions: Instructions) -> f32 {
     x * sigmoid_with(x, instructions)
+}
+
+/// The same, off by less than 4e-5 of x.
+#[inline(always)]
+pub(super) fn activate_roughly(x: f32, instructions: Instructions) -> f32 {
+    x * rough_sigmoid(x, instructions)
 }
 
 #[inline(always)]

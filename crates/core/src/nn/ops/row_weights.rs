@@ -54,6 +54,15 @@ impl RowWeights {
         }
     }
 
+    /// As [`Self::multiply_rows`], for rows with values of one kind. Bytes of them have one scale, so a row's sums depend a little on the
+    /// others.
+    pub(in crate::nn) fn multiply_alike(&self, rows: &[f32], out: &mut [f32]) {
+        match self {
+            Self::Single(weights) => weights.multiply_rows(rows, out),
+            Self::Reduced(weights) => weights.multiply_alike(rows, out),
+        }
+    }
+
     /// The sums of that many rows.
     pub(in crate::nn) fn times(&self, values: &[f32], rows: usize) -> Vec<f32> {
         let mut out = buffer(rows * self.outputs());

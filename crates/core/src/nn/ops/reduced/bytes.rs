@@ -40,9 +40,9 @@ impl ByteRange {
                     return self.write_bytes(values, to);
                 }
                 for (values, to) in values.chunks_exact(channels).zip(to.chunks_exact_mut(length)) {
-                    let (to, rest) = to.split_at_mut(channels);
-                    self.write_bytes(values, to);
-                    rest.fill(self.zero);
+                    // All of the last group, before some of it is overwritten: a few bytes alone would be a call.
+                    *to.last_chunk_mut().expect("places without channels are a bug") = [self.zero; size_of::<Group>()];
+                    self.write_bytes(values, &mut to[..channels]);
                 }
             },
         );
