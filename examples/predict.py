@@ -506,7 +506,9 @@ class DepthNetwork(FlowNetwork):
         return frame, unshuffle(np.clip((far - near) / 4, -4, 4) / 4).reshape(self.half + (4, 2)).sum(2)
 
     def predict(self, frames, actions, state):
-        states, actions = state, limited(actions, self.spec["actions"])
+        # Without states, all are empty.
+        states = [[]] * len(frames) if state is None else state
+        actions = limited(actions, self.spec["actions"]) if self.moves else None
         mean, spread = frames[-1].mean(), max(frames[-1].std(), 0.04)
         frames = [(frame - mean) / spread for frame in frames]
         blocks, shifts = [unshuffle(frames[-1][..., None])], []
@@ -743,13 +745,16 @@ def main():
     last = len(paths) - 1 if arguments.at is None else arguments.at
     images = [path.read_bytes() for path in paths[last + 1 - context : last + 1]]
     frames = [np.asarray(Image.open(io.BytesIO(image)).convert("L"), np.float32) / 255 for image in images]
+    has_depth = spec.get("flow", {}).get("depth", False)
     actions = state = None
     if spec["conditioning"] != "none":
+        if arguments.actions is None:
+            parser.error(f"{arguments.model.name} takes {spec['conditioning']}: give --actions")
         recorded = json.loads(arguments.actions.read_text())
-        actions, state = recorded["actions"][last : last + horizon], recorded["states"][last]
+        actions, states = recorded["actions"][last : last + horizon], recorded["states"]
+        state = states[last + 1 - context : last + 1] if has_depth else states[last]
 
-    if spec.get("flow", {}).get("depth", False):
-        state = recorded["states"][last + 1 - context : last + 1]
+    if has_depth:
         predicted = DepthNetwork(spec, tensors).predict(frames, actions, state)
     elif spec.get("architecture", "dense") == "flow":
         predicted = FlowNetwork(spec, tensors).predict(frames, actions, state)

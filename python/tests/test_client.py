@@ -3,6 +3,9 @@
 import asyncio
 import subprocess
 import threading
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
 
 import numpy as np
 import pytest
@@ -118,6 +121,12 @@ def test_a_plan_turns_to_its_goal(client: foreframe.Client, drive: Drive) -> Non
         client.plan(MODEL, drive.frames[:5], foreframe.Goal(), state=drive.states[4])
 
 
+def test_an_unsafe_plan_says_why_in_words(client: foreframe.Client, drive: Drive) -> None:
+    huge = {"radius_m": 2.0, "solver": None, "seed": 1, "samples": 16, "budget_ms": 5000}
+    found = client.plan("rooms", drive.frames[:5], foreframe.Goal(position_m=(0.4, 0.0)), states=drive.states[:5], **huge)
+    assert (found.safe, found.reason) == (False, "no-free-way") and "would touch" in (found.detail or "")
+
+
 def test_a_plan_shows_what_stands_in_the_way(server: foreframe.Server, client: foreframe.Client, drive: Drive) -> None:
     goal, search = foreframe.Goal(position_m=(0.4, 0.3)), {"seed": 3, "samples": 32, "budget_ms": 5000}
     context = {"states": drive.states[:5], "with_obstacles": True}
@@ -142,6 +151,41 @@ def test_a_plan_shows_what_stands_in_the_way(server: foreframe.Server, client: f
     assert unchecked.obstacles is None and not unchecked.clearance_checked
 
 
+def test_numbers_of_numpy_are_sent(client: foreframe.Client, drive: Drive) -> None:
+    goal = foreframe.Goal(position_m=np.array([0.4, 0.3], np.float32), heading_rad=np.float32(0.1))
+    camera = foreframe.Camera(np.float32(1.2), np.float32(0.2))
+    limits = [{"low": np.float32(0), "high": 0.2}, {"low": -0.5, "high": np.float64(0.5)}]
+    found = client.plan(
+        "rooms", drive.frames[:5], goal, states=drive.states[:5], camera=camera, limits=limits, seed=np.int64(3), samples=8
+    )
+    assert found.actions[:, 0].max() <= 0.2
+    predicted = client.predict(MODEL, drive.frames[:5], actions=drive.actions[:5], state=drive.states[4], steps=np.int64(2))
+    assert len(predicted.frames) == 2
+    with client.session(MODEL) as session:
+        session.plan_every(1, foreframe.Goal(heading_rad=np.float32(0.1)), seed=np.int64(3))
+        stamp = np.int64(7)
+        answer = session.step(
+            drive.frames[0], action=drive.actions[0], state=drive.states[0], steps=np.int64(2), timestamp_us=stamp
+        )
+        assert answer.timestamp_us == 7
+    with client.environment("moving-observer", seed=np.int64(3), world={"frame_period_s": np.float32(0.25)}) as environment:
+        assert environment.world["frame_period_s"] == 0.25
+
+
+def test_a_number_that_cannot_be_sent_is_named(client: foreframe.Client, drive: Drive) -> None:
+    window = {"actions": drive.actions[:5], "state": drive.states[4]}
+    with pytest.raises(ValueError, match=r"state\[1\] is 1e\+300"):
+        client.predict(MODEL, drive.frames[:5], **window | {"state": [0.0, 1e300, 0.0, 0.0, 0.0, 0.0]})
+    with pytest.raises(ValueError, match="steps is 1180591620717411303424"):
+        client.predict(MODEL, drive.frames[:5], **window, steps=2**70)
+    with pytest.raises(ValueError, match="search.solver.seed is"):
+        client.plan(MODEL, drive.frames[:5], foreframe.Goal(heading_rad=0.1), state=drive.states[4], seed=2**64)
+    with pytest.raises(ValueError, match="settings.rate is nan"):
+        client.submit({"kind": "train", "settings": {"rate": np.float32("nan")}})
+    with client.environment("moving-observer") as environment, pytest.raises(ValueError, match=r"action\[1\] is nan"):
+        environment.step([0.0, np.nan])
+
+
 def test_errors_have_the_words_of_the_server(client: foreframe.Client, drive: Drive) -> None:
     with pytest.raises(foreframe.ApiError, match="no model") as missing:
         client.model("nothing")
@@ -151,6 +195,77 @@ def test_errors_have_the_words_of_the_server(client: foreframe.Client, drive: Dr
     assert unfit.value.status == 422 and unfit.value.request_id
     with foreframe.Client("http://127.0.0.1:1") as nobody, pytest.raises(foreframe.ConnectionFailed, match="foreframe serve"):
         nobody.models()
+
+
+class Between:
+    """Something that answers instead of the server: with the first of ``answers``, of which the last stays."""
+
+    def __init__(self) -> None:
+        self.answers: list[tuple[int, dict[str, str], bytes]] = []
+
+        class Handler(BaseHTTPRequestHandler):
+            def do_GET(handler) -> None:
+                status, headers, body = self.answers.pop(0) if len(self.answers) > 1 else self.answers[0]
+                handler.send_response(status)
+                for name, value in headers.items():
+                    handler.send_header(name, value)
+                handler.end_headers()
+                handler.wfile.write(body)
+
+            do_POST = do_GET
+
+            def log_message(handler, *_: Any) -> None:
+                pass
+
+        self.http = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+        self.url = f"http://127.0.0.1:{self.http.server_port}"
+        threading.Thread(target=self.http.serve_forever, daemon=True).start()
+
+
+@pytest.fixture
+def between() -> Iterator[Between]:
+    between = Between()
+    yield between
+    between.http.shutdown()
+    between.http.server_close()
+
+
+PAGE = (200, {"Content-Type": "text/html"}, b"<html>Login</html>")
+
+
+def test_what_is_no_answer_of_the_server_is_an_error_of_this_package(between: Between) -> None:
+    redirect, other = (301, {"Location": "https://robot/"}, b""), (200, {}, b'{"other": 1}')
+    words = [(PAGE, "<html>Login"), (redirect, "a redirect to https://robot/"), (other, '{"other"'), ((200, {}, b""), "it is empty")]
+    with foreframe.Client(between.url) as client:
+        for answer, found in words:
+            between.answers = [answer]
+            with pytest.raises(foreframe.ApiError, match=f"^not an answer of Foreframe: {found}") as refused:
+                client.models()
+            assert refused.value.status == answer[0]
+        between.answers = [PAGE]
+        with pytest.raises(foreframe.ApiError, match="not an answer of Foreframe"):
+            client.wait("job-1")
+        with pytest.raises(foreframe.ApiError, match="not an answer of Foreframe"):
+            client.session(MODEL, reconnect_s=0).step(np.zeros((64, 64), np.uint8))
+    with pytest.raises(ValueError, match="'http://localhost:port' is not the address of a server"):
+        foreframe.Client("http://localhost:port")
+
+
+def test_waiting_survives_a_load_balancer_that_lost_its_server(between: Between, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("foreframe.client.EVENTS_PAUSE_S", 0.01)
+    progress = '"progress": {"done": 1, "total": 1, "message": ""}'
+    job = f'{{"id": "job-1", "spec": {{"kind": "collect"}}, "state": "succeeded", "losses": {{}}, {progress}}}'
+    events = (200, {"Content-Type": "text/event-stream"}, f"event: job\ndata: {job}\n\n".encode())
+    between.answers = [(502, {}, b"<html>Bad Gateway</html>"), (503, {}, b""), events]
+    with foreframe.Client(between.url) as client:
+        assert client.wait("job-1", timeout_s=20).state == "succeeded"
+    between.answers = [(502, {}, b""), events]
+
+    async def wait() -> foreframe.Job:
+        async with foreframe.AsyncClient(between.url) as twin:
+            return await twin.wait("job-1", timeout_s=20)
+
+    assert asyncio.run(wait()).state == "succeeded"
 
 
 def test_a_server_with_keys_wants_one(tmp_path) -> None:
@@ -170,7 +285,7 @@ def test_a_server_with_keys_wants_one(tmp_path) -> None:
 
 
 def test_a_key_that_no_header_can_hold_is_refused_without_telling_it() -> None:
-    for key in ("ffk_secret\n", "ffk_secret…"):
+    for key in ("ffk_secret\n", "ffk_secret…", "ffk_secret ", ""):
         with pytest.raises(ValueError, match="API key") as refused:
             foreframe.Client(key=key)
         assert "secret" not in str(refused.value)

@@ -197,6 +197,22 @@ def test_the_recurrent_form_is_as_by_numpy(drive: Drive, tmp_path: Path) -> None
     assert np.abs(ByOnnx(tmp_path)(window)["predicted"][0] - by_numpy.predict(window)).max() < TOLERANCE
 
 
+def test_the_example_predicts_by_depth_without_states(tmp_path: Path) -> None:
+    """No shipped model has no states and estimates depth: the weights of `rooms` that such a model has."""
+    manifest, tensors = numpy_networks().read_model(MODELS / "rooms")
+    spec = manifest["spec"]
+    name, steps = "flow.modulation.inputs.weight", spec["horizon"]
+    first = len(tensors[name]) - steps - 3
+    tensors[name] = tensors[name][first : first + steps]
+    spec |= {"conditioning": "none", "actions": [], "states": [], "flow": spec["flow"] | {"memory": False}}
+    write_model(tmp_path, manifest, tensors)
+    command = [sys.executable, ROOT / "examples" / "predict.py", "--frames", ROOT / "examples" / "static"]
+    done = subprocess.run([*command, "--model", tmp_path, "--out", tmp_path / "out"], capture_output=True, text=True)
+    assert done.returncode == 0 and len(list((tmp_path / "out").iterdir())) == steps, done.stderr
+    refused = subprocess.run([*command, "--model", MODELS / "rooms", "--out", tmp_path], capture_output=True, text=True)
+    assert refused.returncode == 2 and "rooms takes state-action: give --actions" in refused.stderr
+
+
 def test_what_cannot_be_exported_is_named(tmp_path: Path) -> None:
     with pytest.raises(UnsupportedModel, match=r"not a directory with manifest\.json"):
         export_onnx(tmp_path)

@@ -32,6 +32,28 @@ def test_the_dream_passes_the_check(client: foreframe.Client) -> None:
     starts.close()
 
 
+def test_an_environment_that_the_server_dropped_is_made_again(client: foreframe.Client) -> None:
+    whole, dropped = SimulatorEnv(client), SimulatorEnv(client)
+    starts = SimulatorStarts(client, 5)
+    for seed in (4, None, None, 7):
+        expected, _ = whole.reset(seed=seed)
+        drop(client, dropped._environment)
+        found, _ = dropped.reset(seed=seed)
+        assert np.array_equal(found["state"], expected["state"]) and np.array_equal(found["frame"], expected["frame"])
+    drop(client, starts._environment)
+    assert len(starts(np.random.default_rng(1)).frames) == 5
+    for env in (whole, dropped, starts):
+        env.close()
+    with pytest.raises(foreframe.ApiError) as gone:
+        starts._environment.reset()
+    assert gone.value.status == 404, "it stays closed"
+
+
+def drop(client: foreframe.Client, environment: foreframe.Environment) -> None:
+    """The server deletes an environment, as it does when nobody steps it for a while."""
+    client.run(foreframe.calls.delete_environment(environment.id))
+
+
 @pytest.mark.parametrize("context", [1, 5])
 def test_a_start_has_an_action_between_each_two_frames(client: foreframe.Client, context: int) -> None:
     starts = SimulatorStarts(client, context)

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+import websockets.sync.client
 
 import foreframe
 from conftest import MODELS, PROGRAM, Drive
@@ -127,6 +128,103 @@ def forget(client: foreframe.Client, session: foreframe.Session) -> None:
     client.run(foreframe.calls.delete_session(*session._flow.identity))
 
 
+def test_an_expired_session_is_begun_again(drive: Drive, unbroken: list[foreframe.Answer]) -> None:
+    settings = {"stream_idle_ms": 200, "session_grace_ms": 50}
+    with foreframe.serve(program=PROGRAM, models_dir=MODELS, settings=settings) as server, server.client() as client:
+        with client.session(MODEL) as session:
+            found = answers(session, drive, range(8))
+            until_expired(client)
+            found += answers(session, drive, range(8, 10))
+            until_expired(client)
+            session.rollouts([drive.actions[4:9]])
+            found += answers(session, drive, range(10, 12))
+    same(found, unbroken)
+    assert found[8].replayed and found[10].replayed
+
+
+def until_expired(client: foreframe.Client) -> None:
+    """Waits until the server has no session; to list them is not to use them."""
+    deadline = time.monotonic() + 60
+    while client._http.get("/v1/sessions").json()["sessions"]:
+        assert time.monotonic() < deadline, "the session does not expire"
+        time.sleep(0.02)
+
+
+class Interrupted(BaseException):
+    """As KeyboardInterrupt, which pytest would take for its own."""
+
+
+def interrupt(session: foreframe.Session, error: BaseException, is_read: bool) -> None:
+    """The next answer is interrupted: before it is read, or after that."""
+    connection = session._socket
+    assert connection is not None
+    read = connection.recv
+
+    def broken(timeout: float) -> None:
+        if is_read:
+            read(timeout=timeout)
+        raise error
+
+    connection.recv = broken  # type: ignore[method-assign,assignment]
+
+
+@pytest.mark.parametrize("is_read", [False, True])
+def test_an_interrupted_frame_can_be_sent_again(
+    client: foreframe.Client, drive: Drive, unbroken: list[foreframe.Answer], is_read: bool
+) -> None:
+    with client.session(MODEL) as session:
+        found = answers(session, drive, range(8))
+        interrupt(session, Interrupted(), is_read)
+        # The traceback, which keeps what was interrupted alive, is still there at the next step.
+        with pytest.raises(Interrupted) as _kept:
+            answers(session, drive, range(8, 9))
+        again = session.step(drive.frames[8], action=drive.actions[8], state=drive.states[8], timestamp_us=8)
+        found += [again, *answers(session, drive, range(9, 12))]
+    same(found, unbroken)
+    assert again.timestamp_us == 8
+
+
+@pytest.mark.parametrize("error", [Interrupted(), OSError("cut")])
+def test_a_frame_whose_answer_got_lost_counts(
+    client: foreframe.Client, drive: Drive, unbroken: list[foreframe.Answer], error: BaseException
+) -> None:
+    with client.session(MODEL, reconnect_s=0) as session:
+        found = answers(session, drive, range(8))
+        interrupt(session, error, is_read=True)
+        with pytest.raises((Interrupted, foreframe.ConnectionFailed)):
+            answers(session, drive, range(8, 9))
+        session.rollouts([drive.actions[4:9]])
+        found += answers(session, drive, range(9, 10))
+        # The frame is also among those that are sent again.
+        forget(client, session)
+        session.rollouts([drive.actions[4:9]])
+        found += answers(session, drive, range(10, 12))
+    same(found, unbroken[:8] + unbroken[9:])
+    assert found[9].replayed
+
+
+def test_a_late_attempt_of_its_own_does_not_end_a_session(
+    client: foreframe.Client, drive: Drive, unbroken: list[foreframe.Answer], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        raise Interrupted
+
+    with client.session(MODEL) as session:
+        found = answers(session, drive, range(8))
+        interrupt(session, Interrupted(), is_read=True)
+        with pytest.raises(Interrupted):
+            answers(session, drive, range(8, 9))
+        with monkeypatch.context() as patched, pytest.raises(Interrupted):
+            patched.setattr(websockets.sync.client, "connect", interrupted)
+            answers(session, drive, range(8, 9))
+        found += answers(session, drive, range(8, 10))
+        late = client.url.replace("http", "ws", 1) + "/v1/sessions/{}/stream?token={}".format(*session._flow.identity)
+        with websockets.sync.client.connect(late) as connection:
+            connection.recv()
+        found += answers(session, drive, range(10, 12))
+    same(found, unbroken)
+
+
 def test_a_session_survives_a_restart_of_the_server(tmp_path, drive: Drive, unbroken: list[foreframe.Answer]) -> None:
     free = socket.create_server(("127.0.0.1", 0))
     port = free.getsockname()[1]
@@ -220,6 +318,37 @@ def next_plan(session: foreframe.Session, drive: Drive, from_seq: int) -> forefr
         if answer.plan and answer.plan.seq >= from_seq:
             return answer.plan
     raise AssertionError("no plan came")
+
+
+def test_a_cancelled_step_leaves_no_answer_behind(
+    proxy: Proxy, drive: Drive, unbroken: list[foreframe.Answer], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def stream() -> list[foreframe.Answer]:
+        found: list[foreframe.Answer] = []
+        async with foreframe.AsyncClient(proxy.url) as client, client.session(MODEL) as session:
+
+            async def step(n: int) -> foreframe.Answer:
+                return await session.step(drive.frames[n], action=drive.actions[n], state=drive.states[n])
+
+            for n in range(12):
+                if n == 8:
+                    waits, forever = asyncio.Event(), asyncio.Event()
+
+                    async def never() -> None:
+                        waits.set()
+                        await forever.wait()
+
+                    assert session._socket is not None
+                    monkeypatch.setattr(session._socket, "recv", never)
+                    cancelled = asyncio.create_task(step(n))
+                    await waits.wait()
+                    cancelled.cancel()
+                    await asyncio.wait([cancelled])
+                    monkeypatch.undo()
+                found.append(await step(n))
+        return found
+
+    same(asyncio.run(stream()), unbroken)
 
 
 def test_the_async_session_does_the_same(proxy: Proxy, drive: Drive, unbroken: list[foreframe.Answer]) -> None:

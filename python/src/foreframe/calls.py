@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Generic, TypeAlias, TypeVar
-from urllib.parse import quote
+from urllib.parse import quote, urlsplit
 
 import msgpack
 import numpy as np
@@ -40,10 +40,30 @@ class Call(Generic[T]):
     def content(self) -> bytes | None:
         if self.body is None:
             return None
+        try:
+            return self._packed(self.body)
+        except (OverflowError, ValueError) as error:
+            raise ValueError(self._unsendable(self.body, "")) from error
+
+    def _packed(self, value: Any) -> bytes:
         if self.is_binary:
-            packed: bytes = msgpack.packb(self.body, use_single_float=True)
+            packed: bytes = msgpack.packb(value, use_single_float=True)
             return packed
-        return json.dumps(self.body).encode()
+        return json.dumps(value, allow_nan=False).encode()
+
+    def _unsendable(self, value: Any, name: str) -> str:
+        """What cannot be sent: the innermost part of a value, with its name."""
+        parts: dict[str, Any] = {}
+        if isinstance(value, Mapping):
+            parts = {f"{name}.{key}" if name else key: part for key, part in value.items()}
+        elif isinstance(value, (list, tuple)):
+            parts = {f"{name}[{index}]": part for index, part in enumerate(value)}
+        for place, part in parts.items():
+            try:
+                self._packed(part)
+            except (OverflowError, ValueError):
+                return self._unsendable(part, place)
+        return f"{name} is {value!r}, which cannot be sent; give a finite number below 3.4e38, or an integer of at most 64 bits"
 
     def all_headers(self) -> dict[str, str]:
         media_type = "application/msgpack" if self.is_binary else "application/json"
@@ -64,9 +84,17 @@ def authorization(key: str | None) -> dict[str, str]:
     """The header of an API key. Raises ValueError, which does not tell the key, for a key that no header can hold."""
     if key is None:
         return {}
-    if not (key.isascii() and key.isprintable()):
-        raise ValueError("the API key has a line break or another character that no key has")
+    if not key:
+        raise ValueError("the API key is empty; give None to a server without keys")
+    if " " in key or not (key.isascii() and key.isprintable()):
+        raise ValueError("the API key has a space, a line break or another character that no key has")
     return {"Authorization": f"Bearer {key}"}
+
+
+def uses_proxy(url: str) -> bool:
+    """Whether the proxies of the environment count for a server: not for one on this machine."""
+    parts = urlsplit(url)
+    return not (parts.scheme == "http" and parts.hostname in ("127.0.0.1", "::1", "localhost"))
 
 
 def numbers(values: Any) -> Any:
@@ -74,9 +102,19 @@ def numbers(values: Any) -> Any:
     return None if values is None else np.asarray(values, np.float64).tolist()
 
 
+def plain(value: Any) -> Any:
+    """A value whose parts of NumPy's types are numbers and lists."""
+    if isinstance(value, (np.generic, np.ndarray)):
+        return value.tolist()
+    if isinstance(value, Mapping):
+        return {name: plain(part) for name, part in value.items()}
+    return [plain(part) for part in value] if isinstance(value, (list, tuple)) else value
+
+
 def given(**fields: Any) -> dict[str, Any]:
-    """The fields that are not None."""
-    return {name: value for name, value in fields.items() if value is not None}
+    """The fields that are not None. Lists are plain already: they may be long."""
+    known = {name: value for name, value in fields.items() if value is not None}
+    return {name: value if isinstance(value, list) else plain(value) for name, value in known.items()}
 
 
 def models(after: str | None) -> Call[tuple[list[Model], str | None]]:
@@ -222,7 +260,7 @@ def session_plan_body(spec: Spec, goal: Goal, with_obstacles: bool, search: Mapp
 def _search(search: Mapping[str, Any]) -> Mapping[str, Any] | None:
     """The settings of a search that are given, those of the solver in an object of their own."""
     solver = {name: search[name] for name in _SOLVER if search.get(name) is not None}
-    if "solver" in search:
+    if search.get("solver") is not None:
         solver["kind"] = search["solver"]
     others = {name: value for name, value in search.items() if name not in (*_SOLVER, "solver") and value is not None}
     return given(**others, solver=solver or None) or None
@@ -264,7 +302,7 @@ def job(job_id: str) -> Call[Job]:
 
 def submit(spec: Mapping[str, Any], idempotency_key: str | None) -> Call[Job]:
     headers = {} if idempotency_key is None else {"Idempotency-Key": idempotency_key}
-    return Call("POST", path("jobs"), Job.of, given(**spec), headers=headers)
+    return Call("POST", path("jobs"), Job.of, given(**plain(spec)), headers=headers)
 
 
 def change_job(job_id: str, change: str) -> Call[Job]:

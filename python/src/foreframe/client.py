@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import calls
-from .calls import Call, Plans, Vector, Vectors, authorization
+from .calls import Call, Plans, Vector, Vectors, authorization, uses_proxy
 from .environment import Environment
-from .errors import ConnectionFailed, JobFailed, api_error
+from .errors import ConnectionFailed, JobFailed, Unavailable, api_error
 from .events import EventReader
 from .flow import follow, follow_async
 from .images import FrameLike
@@ -37,10 +37,26 @@ def _unreachable(url: str, error: Exception) -> ConnectionFailed:
     return ConnectionFailed(f"no server answers at {url} ({error}); start one with: foreframe serve")
 
 
+def _options(url: str, key: str | None, timeout_s: float) -> dict[str, Any]:
+    """The options of the HTTP client. Raises ValueError for an address or a key that cannot be one."""
+    try:
+        base_url = httpx.URL(url)
+    except httpx.InvalidURL as error:
+        raise ValueError(f"{url!r} is not the address of a server, such as {DEFAULT_URL}: {error}") from error
+    return {"base_url": base_url, "headers": authorization(key), "timeout": timeout_s, "trust_env": uses_proxy(url)}
+
+
 def _result(call: Call[T], response: httpx.Response) -> T:
-    if response.status_code >= 400:
+    if not response.is_success:
         raise api_error(response.status_code, response.headers, response.content)
-    return call.result(response.content)
+    try:
+        return call.result(response.content)
+    except (ValueError, LookupError, TypeError, AttributeError) as error:
+        raise api_error(response.status_code, response.headers, response.content) from error
+
+
+def _has_events(response: httpx.Response) -> bool:
+    return response.is_success and response.headers.get("content-type", "").startswith("text/event-stream")
 
 
 def _request(call: Call[Any]) -> dict[str, Any]:
@@ -100,7 +116,7 @@ class Client:
     def __init__(self, url: str = DEFAULT_URL, *, key: str | None = None, timeout_s: float = 30.0) -> None:
         self.url = url.rstrip("/")
         self.key = key
-        self._http = httpx.Client(base_url=self.url, headers=authorization(key), timeout=timeout_s)
+        self._http = httpx.Client(**_options(self.url, key, timeout_s))
         self._specs = _Specs()
 
     def __enter__(self) -> Client:
@@ -307,13 +323,16 @@ class Client:
         while True:
             try:
                 with self._http.stream("GET", watched.path, headers=watched.headers(), timeout=watched.timeout()) as response:
-                    if response.status_code >= 400:
+                    if not _has_events(response):
                         raise api_error(response.status_code, response.headers, response.read())
                     for line in response.iter_lines():
                         watched.line(line)
             except httpx.TransportError as error:
                 if watched.is_late() or not _is_break(error):
                     raise _unreachable(self.url, error) from error
+            except Unavailable:
+                if watched.is_late():
+                    raise
             if watched.over is not None:
                 return watched.over
             watched.check_time()
@@ -389,7 +408,7 @@ class AsyncClient:
     def __init__(self, url: str = DEFAULT_URL, *, key: str | None = None, timeout_s: float = 30.0) -> None:
         self.url = url.rstrip("/")
         self.key = key
-        self._http = httpx.AsyncClient(base_url=self.url, headers=authorization(key), timeout=timeout_s)
+        self._http = httpx.AsyncClient(**_options(self.url, key, timeout_s))
         self._specs = _Specs()
 
     async def __aenter__(self) -> AsyncClient:
@@ -582,13 +601,16 @@ class AsyncClient:
             try:
                 stream = self._http.stream("GET", watched.path, headers=watched.headers(), timeout=watched.timeout())
                 async with stream as response:
-                    if response.status_code >= 400:
+                    if not _has_events(response):
                         raise api_error(response.status_code, response.headers, await response.aread())
                     async for line in response.aiter_lines():
                         watched.line(line)
             except httpx.TransportError as error:
                 if watched.is_late() or not _is_break(error):
                     raise _unreachable(self.url, error) from error
+            except Unavailable:
+                if watched.is_late():
+                    raise
             if watched.over is not None:
                 return watched.over
             watched.check_time()

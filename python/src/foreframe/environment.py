@@ -56,19 +56,26 @@ class Step:
 
 
 class Environment:
-    """An environment of the server; it ends with ``close``, or when nobody steps it for a while."""
+    """An environment of the server. It ends with ``close``, or when nobody steps it for a while; then ``reset`` makes it anew."""
 
     def __init__(self, client: Client, scenario: str, seed: int, world: Mapping[str, Any] | None) -> None:
         self._client = client
-        body = client.run(calls.create_environment(scenario, seed, world))
+        self._scenario, self._seed, self._world = scenario, seed, world
+        #: The number of the episode among those of the seed.
+        self._trial = 0
+        self._is_closed = False
+        #: The first observation.
+        self.observation = Observation.of(self._create(seed))
+
+    def _create(self, seed: int) -> Mapping[str, Any]:
+        body = self._client.run(calls.create_environment(self._scenario, seed, self._world))
         self.id: str = body["id"]
         #: Components of an action, with what the robot can do as their bounds.
         self.actions: tuple[Channel, ...] = channels(body["action"], body["action_bounds"])
         #: Components of a state; they have no bounds.
         self.states: tuple[Channel, ...] = channels(body["state"], [{"low": -np.inf, "high": np.inf}] * len(body["state"]))
         self.world: Mapping[str, Any] = body["world"]
-        #: The first observation.
-        self.observation = Observation.of(body)
+        return body
 
     @property
     def size(self) -> tuple[int, int]:
@@ -77,7 +84,18 @@ class Environment:
 
     def reset(self, seed: int | None = None) -> Observation:
         """Begins the first episode of a seed; without a seed, the next one."""
-        self.observation = Observation.of(self._client.run(calls.reset_environment(self.id, seed)))
+        begun, trial = (self._seed, self._trial + 1) if seed is None else (seed, 0)
+        try:
+            body = self._client.run(calls.reset_environment(self.id, seed))
+        except ApiError as error:
+            if error.status != 404 or self._is_closed:
+                raise
+            # The server dropped it. The new one comes to the same episode.
+            body = self._create(begun)
+            for _ in range(trial):
+                body = self._client.run(calls.reset_environment(self.id, None))
+        self._seed, self._trial = begun, trial
+        self.observation = Observation.of(body)
         return self.observation
 
     def step(self, action: calls.Vector) -> Step:
@@ -88,6 +106,7 @@ class Environment:
 
     def close(self) -> None:
         """Deletes the environment; does nothing if it is gone."""
+        self._is_closed = True
         try:
             self._client.run(calls.delete_environment(self.id))
         except ApiError as error:

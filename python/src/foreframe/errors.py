@@ -71,6 +71,11 @@ class JobFailed(ForeframeError):
 
 def api_error(status: int, headers: Mapping[str, str], body: bytes) -> ApiError:
     """The error of a response; its body is problem details (RFC 9457), unless something between us answered."""
+    if status < 400:
+        # For example the redirect or the login page of a proxy.
+        location = headers.get("location")
+        found = f"a redirect to {location}" if location else body.decode(errors="replace").strip()[:200] or "it is empty"
+        return ApiError(status, f"not an answer of Foreframe: {found}")
     try:
         problem = json.loads(body)
         words = (str(problem["detail"]), str(problem["type"]), str(problem["instance"]))

@@ -265,9 +265,10 @@ class Plan(PlannedActions):
     version: int
     #: The next best plans, which differ, best first.
     runners_up: tuple[PlannedActions, ...] = field(repr=False)
-    #: Whether the plan is safe, as far as it was checked; otherwise ``reason`` says why not.
+    #: Whether the plan is safe, as far as it was checked; otherwise ``reason`` says why not, and ``detail`` says it in words.
     safe: bool
     reason: str | None
+    detail: str | None
     #: Whether the way was checked against what the model's depth network sees in the last frame, and against where movers will
     #: be, if it finds them.
     clearance_checked: bool
@@ -291,6 +292,7 @@ class Plan(PlannedActions):
             runners_up=tuple(PlannedActions.read(other, image_format, size) for other in body["runners_up"]),
             safe=body["safe"],
             reason=body.get("reason"),
+            detail=body.get("detail"),
             clearance_checked=body["clearance_checked"],
             obstacles=Obstacles.of(body["obstacles"]) if "obstacles" in body else None,
             novelty=body.get("novelty"),

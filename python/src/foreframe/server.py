@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import atexit
+import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -16,6 +18,7 @@ from types import TracebackType
 
 import httpx
 
+from .calls import uses_proxy
 from .client import Client
 from .errors import ServerNotStarted
 
@@ -29,12 +32,16 @@ class Server:
     def __init__(self, process: subprocess.Popen[bytes], directory: tempfile.TemporaryDirectory[str]) -> None:
         self._process = process
         self._directory = directory
+        #: What it had printed when it was closed.
+        self._last_log: str | None = None
         #: Where it listens.
         self.url = ""
 
     @property
     def log(self) -> str:
         """What it printed."""
+        if self._last_log is not None:
+            return self._last_log
         return (Path(self._directory.name) / "log").read_text(errors="replace")
 
     def client(self, *, key: str | None = None) -> Client:
@@ -46,11 +53,15 @@ class Server:
         atexit.unregister(self.close)
         if self._process.stdin:
             self._process.stdin.close()
+        # Children that this process forked, for example of gymnasium's AsyncVectorEnv, keep the pipe open.
+        self._process.terminate()
         try:
             self._process.wait(timeout=30)
         except subprocess.TimeoutExpired:
-            self._process.kill()
+            # The guard has a process group of its own, with the server.
+            os.killpg(self._process.pid, signal.SIGKILL)
             self._process.wait()
+        self._last_log = self.log
         self._directory.cleanup()
 
     def __enter__(self) -> Server:
@@ -129,7 +140,7 @@ def _wait_until_ready(server: Server, deadline: float) -> None:
 
 def _is_ready(url: str) -> bool:
     try:
-        return httpx.get(f"{url}/readyz", timeout=5).status_code == 200
+        return httpx.get(f"{url}/readyz", timeout=5, trust_env=uses_proxy(url)).status_code == 200
     except httpx.TransportError:
         return False
 

@@ -12,7 +12,7 @@ import websockets.sync.client
 from websockets.exceptions import InvalidStatus, WebSocketException
 from websockets.typing import Subprotocol
 
-from .calls import Call, Plans, Vector, Vectors, authorization
+from .calls import Call, Plans, Vector, Vectors, authorization, plain, uses_proxy
 from .errors import ApiError, ForeframeError, api_error
 from .flow import follow, follow_async
 from .images import FrameLike
@@ -36,6 +36,7 @@ def _socket_options(client: Client | AsyncClient) -> dict[str, Any]:
         "open_timeout": ANSWER_S,
         "close_timeout": 1.0,
         "compression": None,
+        "proxy": True if uses_proxy(client.url) else None,
     }
 
 
@@ -96,8 +97,11 @@ class Session:
 
         ``plan``: the future actions. Default: ``action``, repeated. Raises StreamError if the server refuses the frame: then
         nothing has changed, and a corrected frame may follow.
+
+        If it is interrupted or raises ConnectionFailed, the same frame may be sent again: it counts once. If another frame
+        follows, the interrupted one counts if the server has it, which ``seq`` of the next answer shows.
         """
-        return self._run(self._flow.step(frame, action, state, plan, steps, timestamp_us))
+        return self._run(self._flow.step(frame, action, state, plan, steps, plain(timestamp_us)))
 
     def rollouts(self, plans: Plans, *, state: Vector | None = None, steps: int | None = None) -> Rollouts:
         """Predicts the frames of each of ``plans`` ``[plans, steps, action]`` from the last frame."""
@@ -217,7 +221,7 @@ class AsyncSession:
         timestamp_us: int | None = None,
     ) -> Answer:
         """As :meth:`Session.step`."""
-        return await self._run(self._flow.step(frame, action, state, plan, steps, timestamp_us))
+        return await self._run(self._flow.step(frame, action, state, plan, steps, plain(timestamp_us)))
 
     async def rollouts(self, plans: Plans, *, state: Vector | None = None, steps: int | None = None) -> Rollouts:
         """As :meth:`Session.rollouts`."""

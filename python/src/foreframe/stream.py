@@ -24,6 +24,10 @@ SUBPROTOCOL = "foreframe.v1.msgpack"
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.1, 2.0
 #: The server closes a stream for good only for these reasons.
 FINAL_REASONS = frozenset({"replaced", "deleted", "revoked", "too_long"})
+#: The HTTP statuses of a session that the server does not have: unknown, expired.
+LOST_STATUSES = (404, 410)
+#: How long the server may still accept an attempt to connect that the client has given up, in seconds.
+ATTEMPT_S = 30.0
 
 
 @dataclass(frozen=True)
@@ -76,6 +80,9 @@ class SessionFlow:
     The server keeps a session for a while after its socket closed. If it lost the session (it restarted, or the client was
     away for too long), a new one is opened and the last frames of the context are sent again, so that the next prediction
     is the same. Frames are numbered by ``seq``, which counts on; the server's own numbers begin at 0 in each new session.
+
+    If a step ends without an answer (an exception of a signal handler, a cancelled coroutine, ConnectionFailed), the stream
+    is opened again, since the answer may still arrive on the old socket. Only then it is known whether the server has the frame.
     """
 
     def __init__(self, model: str, resize: str | None, camera: Camera | None, reconnect_s: float) -> None:
@@ -90,10 +97,16 @@ class SessionFlow:
         self._id = ""
         self._token = ""
         self._is_open = False
+        #: Until when "replaced" may come from an attempt of this session itself.
+        self._attempt_until = 0.0
         #: Why the session has ended for good; empty while it has not.
         self._end = ""
         #: The number of the frame that the server counts as 0.
         self._first_seq = 0
+        #: The frame that the server expected next when the stream was opened.
+        self._server_seq = 0
+        #: The last frame that was sent.
+        self._sent: dict[str, Any] = {}
         self._replayed = False
         #: What the server was told of plans; sent again to a new stream.
         self._plans: dict[str, Any] | None = None
@@ -136,12 +149,7 @@ class SessionFlow:
             "format": image_format,
             **given(action=numbers(action), state=numbers(state), plan=numbers(plan), steps=steps),
         }
-        self._replayed = False
         answer = yield from self._answered(message)
-        self._context.append(message)
-        while len(self._context) > self.spec.context:
-            self._context.popleft()
-        self.next_seq += 1
         return self._read(answer)
 
     def rollouts(self, plans: Plans, state: Vector | None, steps: int | None) -> Flow[Rollouts]:
@@ -190,7 +198,7 @@ class SessionFlow:
         before, self._plans = self._plans, plans
         try:
             try:
-                yield from self._configure_plans()
+                yield from self._whole(self._configure_plans())
             except Broken:
                 # A new stream is told of them when it is opened.
                 self._is_open = False
@@ -218,7 +226,7 @@ class SessionFlow:
             found: T = yield call(self.spec)
             return found
         except ApiError as error:
-            if error.status != 404:
+            if error.status not in LOST_STATUSES:
                 raise
         # The server lost the session, and the socket has not broken yet.
         self._is_open = False
@@ -232,16 +240,39 @@ class SessionFlow:
             try:
                 if not self._is_open:
                     yield from self._connect()
-                answer = yield from self._exchange(message, self.next_seq)
-                return answer
+                return (yield from self._whole(self._exchange(message)))
             except Broken as error:
                 self._is_open = self._is_open and error.retry_after_s > 0
                 pause = yield from self._wait(error, deadline, pause)
 
-    def _exchange(self, message: dict[str, Any], seq: int) -> Flow[Mapping[str, Any]]:
+    def _whole(self, exchange: Flow[T]) -> Flow[T]:
+        """An exchange. If it is interrupted, the stream is opened again, so that nothing else receives its answer."""
+        try:
+            return (yield from exchange)
+        except (Broken, StreamError):
+            raise
+        except BaseException:
+            self._is_open = False
+            raise
+
+    def _exchange(self, message: dict[str, Any]) -> Flow[Mapping[str, Any]]:
         """Sends a frame; gives the answer to it. If the server knows the frame already, it answers again."""
-        yield from self._send(message, seq)
-        return (yield from self._answer())
+        if self._server_seq > self.next_seq and not _is_repeated(self._sent, message):
+            # The server has the frame before, whose answer got lost.
+            self._count(self._sent)
+        self._sent = message
+        yield from self._send(message, self.next_seq)
+        answer = yield from self._answer(self.next_seq)
+        self._count(message)
+        return answer
+
+    def _count(self, message: dict[str, Any]) -> None:
+        """Counts a frame that is in the context of the server."""
+        assert self.spec is not None
+        self.next_seq += 1
+        self._context.append(message)
+        while len(self._context) > self.spec.context:
+            self._context.popleft()
 
     def _send(self, message: dict[str, Any], seq: int) -> Flow[None]:
         try:
@@ -251,11 +282,11 @@ class SessionFlow:
             while True:
                 yield from self._receive()
 
-    def _answer(self) -> Flow[Mapping[str, Any]]:
-        """The answer to the frame that was sent first of those without one."""
+    def _answer(self, seq: int) -> Flow[Mapping[str, Any]]:
+        """The answer to a frame; answers to other frames are skipped."""
         while True:
             answer = yield from self._receive()
-            if answer["type"] in ("prediction", "buffering", "overtaken"):
+            if answer["type"] in ("prediction", "buffering", "overtaken") and answer["seq"] == seq - self._first_seq:
                 return answer
             if answer["type"] == "error":
                 if answer["code"] == "overloaded":
@@ -269,7 +300,8 @@ class SessionFlow:
         if answer["type"] == "closing":
             self._is_open = False
             yield Shut()
-            if answer["reason"] in FINAL_REASONS:
+            is_own = answer["reason"] == "replaced" and time.monotonic() < self._attempt_until
+            if answer["reason"] in FINAL_REASONS and not is_own:
                 self._end = answer["reason"]
                 raise StreamClosed(self._end)
             raise Broken(f"the server closed the stream: {answer['reason']}")
@@ -282,13 +314,14 @@ class SessionFlow:
         if self._id:
             try:
                 ready = yield from self._open_socket()
+                self._server_seq = ready["next_seq"] + self._first_seq
                 # One more if the server had the frame whose answer got lost.
-                if ready["next_seq"] in (self.next_seq - self._first_seq, self.next_seq - self._first_seq + 1):
+                if self._server_seq in (self.next_seq, self.next_seq + 1):
                     self._is_open = True
                     return
                 yield Shut()
             except ApiError as error:
-                if error.status != 404:
+                if error.status not in LOST_STATUSES:
                     raise
         yield from self._begin()
 
@@ -306,25 +339,29 @@ class SessionFlow:
         try:
             yield from self._open_socket()
         except ApiError as error:
-            if error.status != 404:
+            if error.status not in LOST_STATUSES:
                 raise
             raise Broken("the server that made the session is gone") from error
-        self._first_seq = self.next_seq - len(self._context)
+        self._first_seq, self._server_seq = self.next_seq - len(self._context), self.next_seq
+        self._replayed = bool(self._context)
         # All at once: each would wait for the answer to the one before.
         for index, message in enumerate(self._context):
             # Only the last of a full context is predicted from, and nobody reads that.
             yield from self._send(_one_step(message), self._first_seq + index)
-        for _ in self._context:
-            yield from self._answer()
-        self._replayed = bool(self._context)
+        for index in range(len(self._context)):
+            yield from self._answer(self._first_seq + index)
         self._is_open = True
 
     def _open_socket(self) -> Flow[Mapping[str, Any]]:
         try:
             yield Open(f"/v1/sessions/{self._id}/stream?token={quote(self._token)}")
+            ready = yield from self._receive()
         except Unavailable as error:
             raise Broken(error.detail, error.retry_after_s) from error
-        ready = yield from self._receive()
+        except BaseException:
+            # The server may accept it all the same, and later than the next attempt.
+            self._attempt_until = time.monotonic() + ATTEMPT_S
+            raise
         self.spec, self.version = Spec.of(ready["spec"]), ready["version"]
         if self._plans is not None:
             try:
@@ -358,6 +395,7 @@ class SessionFlow:
             known = {**answer, "model": self._model, "version": self.version}
             prediction = Prediction.of(known, self.spec.size)
         need = self.spec.context
+        replayed, self._replayed = self._replayed, False
         newest, self._newest_plan = self._newest_plan, None
         plan = None
         if newest is not None:
@@ -365,13 +403,19 @@ class SessionFlow:
             plan = FramePlan(newest["seq"] + self._first_seq, found, newest["skipped"])
         return Answer(
             seq=answer["seq"] + self._first_seq,
-            timestamp_us=answer["timestamp_us"],
+            # The server answers a repeated frame with the time of the first attempt.
+            timestamp_us=self._sent["timestamp_us"],
             prediction=prediction,
             have=answer.get("have", need),
             need=need,
-            replayed=self._replayed,
+            replayed=replayed,
             plan=plan,
         )
+
+
+def _is_repeated(one: dict[str, Any], other: dict[str, Any]) -> bool:
+    """Whether both are the same frame, perhaps sent at different times."""
+    return {**one, "timestamp_us": 0} == {**other, "timestamp_us": 0}
 
 
 def _one_step(message: dict[str, Any]) -> dict[str, Any]:
