@@ -109,7 +109,7 @@ fn training(c: &mut Criterion) {
     let (seen, ahead) = (values((WINDOWS, context, pixels)), values((WINDOWS, horizon, pixels)));
     let mut adam = Optimizer::new(OptimizerConfig::default());
     let mut update = |loss: &Tensor| {
-        let gradients = Gradients::of(loss, &parameters, &[]).unwrap();
+        let gradients = Gradients::of(loss, &parameters).unwrap();
         adam.update(&parameters, &gradients, 1e-4).unwrap()
     };
     c.bench_function("training step of 64 windows", |b| {

@@ -9,7 +9,7 @@ use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
-use crate::server::{ServerConfig, SettingError};
+use crate::server::{ServerConfig, SettingError, is_origin};
 use crate::telemetry::LogFormat;
 use foreframe_core::error_kind::{ErrorKind, HasErrorKind};
 use foreframe_core::nn::{NnError, device, precision};
@@ -145,6 +145,13 @@ impl LoadedConfig {
             let (origin, least, most) = (values.origin(field), range.start(), range.end());
             ConfigError::Value(format!("{field} is {value} ({origin}); it must be {least} to {most}"))
         })?;
+        if let Some(wrong) = server.cors_origins.iter().find(|origin| !is_origin(origin)) {
+            let origin = values.origin("cors_origins");
+            return Err(ConfigError::Value(format!(
+                "cors_origins holds \"{wrong}\" ({origin}); an origin is http:// or https://, a host and perhaps a port, as in \
+                 https://robots.example"
+            )));
+        }
         let mut config: Config = values.extract(expected)?;
         for url in [
             &mut server.database_url,

@@ -32,6 +32,7 @@ mod world_session;
 
 pub use admin::serve_worker_health;
 pub use config::{ServerConfig, SettingError};
+pub(crate) use http::origin::is_origin;
 pub use http::problem::Problem;
 pub use http::tls::{ServerTls, TlsError};
 pub use http::{keys, shutdown};

@@ -1,6 +1,5 @@
 //! `foreframe drive`
 
-use std::io::{IsTerminal as _, Write as _};
 use std::path::PathBuf;
 use std::time::Duration;
 
@@ -8,6 +7,7 @@ use super::error::CliError;
 use super::interrupt;
 use super::output::OutputDirectory;
 use super::process::print_line;
+use super::progress::ProgressLine;
 use super::settings::CommonArgs;
 use super::table::aligned;
 use super::workspace::Workspace;
@@ -95,23 +95,13 @@ pub(super) fn run(args: &DriveArgs) -> Result<(), CliError> {
         duration_s: args.duration,
         budget: args.budget_ms.map(Duration::from_millis),
     };
-    let shows_progress = std::io::stderr().is_terminal();
     let is_stopped = interrupt::flag()?;
-    let scores = drive::run(model, &settings, &is_stopped, &|driver, episode| {
-        if shows_progress {
-            // Progress that cannot be shown does not stop a drive.
-            let _ = write!(
-                std::io::stderr(),
-                "\r{}: {} of {}  ",
-                driver.name(),
-                episode,
-                args.episodes
-            );
-        }
-    });
-    if shows_progress {
-        let _ = writeln!(std::io::stderr());
-    }
+    let (progress, total) = (ProgressLine::new("episodes"), u64::from(args.episodes));
+    let on_episode = |driver: DriverKind, done: usize| {
+        progress.update(done as u64, total, || driver.name().to_owned());
+    };
+    let scores = drive::run(model, &settings, &is_stopped, &on_episode);
+    progress.finish();
     let scores = scores?;
     let finished: usize = scores.iter().map(|of_driver| of_driver.episodes.len()).sum();
     let asked = settings.episodes * settings.drivers.len();
@@ -177,6 +167,9 @@ fn print_table(scores: &[DriverScores]) -> Result<(), CliError> {
     for line in aligned(header, &rows) {
         print_line(line)?;
     }
+    if scores.iter().any(|of_driver| !of_driver.intervals_are_reliable) {
+        print_line("the intervals of so few episodes are not to be trusted; drive 10 or more")?;
+    }
     Ok(())
 }
 
@@ -199,8 +192,15 @@ fn row(scores: &DriverScores) -> [String; 12] {
 }
 
 fn text(score: &DriveScore) -> String {
+    // Without a sign of a zero.
+    let rounded = |value: f64| format!("{:.2}", (100.0 * value).round() / 100.0 + 0.0);
     match score.interval {
-        None => format!("{:.2}", score.mean),
-        Some(interval) => format!("{:.2} ({:.2} … {:.2})", score.mean, interval.low, interval.high),
+        None => rounded(score.mean),
+        Some(interval) => format!(
+            "{} ({} … {})",
+            rounded(score.mean),
+            rounded(interval.low),
+            rounded(interval.high)
+        ),
     }
 }

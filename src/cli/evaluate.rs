@@ -82,7 +82,8 @@ pub(super) struct EvaluateArgs {
     /// Fail if the skill on any set is lower than this; the report is written anyway
     #[arg(long, value_name = "SKILL", allow_negative_numbers = true, value_parser = skill)]
     min_skill: Option<f64>,
-    /// Also write the scores into the model's manifest; scores of other splits in it are kept
+    /// Also write the scores into the model's manifest, unless they are of frames that were in its training; scores of other splits in
+    /// it are kept, and those of another data set are not replaced
     #[arg(long)]
     save_scores: bool,
     /// Also write the report with its figures as one page, report.html
@@ -104,6 +105,16 @@ enum SplitChoice {
     Test,
     /// Every window of a data set that holds nothing but test data, such as the published file of a benchmark
     All,
+}
+
+impl From<SplitChoice> for ScoredSplit {
+    fn from(choice: SplitChoice) -> Self {
+        match choice {
+            SplitChoice::Validation => Self::Validation,
+            SplitChoice::Test => Self::Test,
+            SplitChoice::All => Self::WholeSet,
+        }
+    }
 }
 
 /// Reads a skill, which is at most 1.
@@ -146,13 +157,13 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<(), CliError> {
         .iter()
         .map(|novel| Ok(workspace.open_dataset(novel)?.1))
         .collect::<Result<Vec<Dataset>, CliError>>()?;
+    let split = ScoredSplit::from(args.split);
+    if args.save_scores {
+        evaluation::check_saving(&loaded, &dataset, split)?;
+    }
     let output = OutputDirectory::create(&out)?;
     let config = EvaluateConfig {
-        split: match args.split {
-            SplitChoice::Validation => ScoredSplit::Validation,
-            SplitChoice::Test => ScoredSplit::Test,
-            SplitChoice::All => ScoredSplit::WholeSet,
-        },
+        split,
         max_windows: args.windows,
         nearest_windows: args.nearest_windows as usize,
         bootstrap_samples: args.resamples as usize,
@@ -176,15 +187,7 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<(), CliError> {
     }
     output.finish()?;
     if args.save_scores {
-        let mut scores = report.headline();
-        for skipped in report.sets.iter().filter(|set| set.outcome.scores().is_none()) {
-            scores[&skipped.split] = serde_json::Value::Null;
-        }
-        if config.split == ScoredSplit::Test {
-            // Earlier versions scored unseen pairs and gains as one set.
-            scores["test-unseen"] = serde_json::Value::Null;
-        }
-        registry::record_metrics(&model_dir, scores)?;
+        save_scores(&report, &model_dir)?;
     }
     if args.json {
         print_line(as_json(&report, &out))?;
@@ -194,12 +197,27 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<(), CliError> {
     args.min_skill.map_or(Ok(()), |least| require_skill(&report, least))
 }
 
+/// Writes the scores into the model's manifest. Errors: `Failed` if they are of frames that were in its training.
+fn save_scores(report: &EvaluationReport, model_dir: &Path) -> Result<(), CliError> {
+    if report.has_frames_of_training() {
+        return Err(CliError::Failed(format!(
+            "frames of data set \"{}\" were in the training of model \"{}\", so its scores are not saved; the report is written",
+            report.stamp.dataset, report.stamp.model
+        )));
+    }
+    let mut scores = report.headline();
+    for skipped in report.sets.iter().filter(|set| set.outcome.scores().is_none()) {
+        scores[&skipped.split] = Value::Null;
+    }
+    Ok(registry::record_metrics(model_dir, scores)?)
+}
+
 /// The scores in a table, what they say, and where the report is.
 fn print_summary(report: &EvaluationReport, out: &Path, has_page: bool) -> Result<(), CliError> {
     print_scores(&report.headline(), "")?;
     for set in &report.sets {
         let Some(scores) = set.outcome.scores() else { continue };
-        let verdicts = [Some(scores.verdict()), scores.verdict_against_unfitted()];
+        let verdicts = [report.verdict(set), scores.verdict_against_unfitted()];
         for verdict in verdicts.into_iter().flatten() {
             print_line(format!("{}: {verdict}", set.split))?;
         }
@@ -228,7 +246,7 @@ fn print_summary(report: &EvaluationReport, out: &Path, has_page: bool) -> Resul
 /// What the scores of each set say.
 fn verdicts(report: &EvaluationReport) -> impl Iterator<Item = (&str, String)> {
     let sets = report.sets.iter();
-    sets.filter_map(|set| Some((set.split.as_str(), set.outcome.scores()?.verdict())))
+    sets.filter_map(|set| Some((set.split.as_str(), report.verdict(set)?)))
 }
 
 /// The same for programs, in one line.

@@ -204,8 +204,7 @@ fn write_png(args: &ExportArgs, dataset: &Dataset, range: Range<usize>) -> Resul
         output.write(&format!("frame-{index:03}.png"), &png)?;
         frames.push(frame);
     }
-    let delay_ms = (dataset.info().frame_period_s * 1000.0).round() as u32;
-    let gif = enlarged_gif(&frames, delay_ms).map_err(CliError::failed)?;
+    let gif = enlarged_gif(&frames, dataset.info().frame_period_s).map_err(CliError::failed)?;
     output.write("episode.gif", &gif)?;
     let actions: Vec<&[f32]> = range.clone().map(|frame| dataset.action(frame)).collect();
     let states: Vec<&[f32]> = range.map(|frame| dataset.state(frame)).collect();

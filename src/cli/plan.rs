@@ -14,7 +14,7 @@ use super::settings::CommonArgs;
 use super::workspace::Workspace;
 use foreframe_core::frame::{Frame, codec};
 use foreframe_core::planning::{
-    Goal, PlanChoice, PlanContext, PlanError, PlanSettings, PlannerInput, SolverKind, SolverSettings, plan,
+    Goal, PlanChoice, PlanError, PlanSettings, PlannerInput, SolverKind, SolverSettings, plan,
 };
 use foreframe_core::registry::Model;
 use foreframe_core::serving::{PredictionInput, Task};
@@ -90,7 +90,7 @@ pub(super) struct PlanArgs {
 /// The context, and what the search starts from.
 struct Asked {
     seen: Vec<Frame>,
-    context: PlanContext,
+    context: Task,
     input: PlannerInput,
 }
 
@@ -142,7 +142,7 @@ fn asked(args: &PlanArgs, model: &Model) -> Result<Asked, CliError> {
     let task = Task::rollout(seen.clone(), known.past_states, None, Vec::new(), manifest).map_err(PlanError::from)?;
     Ok(Asked {
         seen,
-        context: PlanContext::new(task),
+        context: task,
         input: PlannerInput {
             goal: Goal {
                 position_m: args.goal,

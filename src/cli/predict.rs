@@ -143,11 +143,10 @@ fn write(output: &OutputDirectory, spec: &ModelSpec, selected: &Selected, predic
         output.write(&format!("predicted-{}.png", index + 1), &png(frame)?)?;
     }
     output.write("contact-sheet.png", &png(&contact_sheet(selected, predicted)?)?)?;
-    let delay_ms = (spec.frame_period_s * 1000.0).round() as u32;
     let film: Vec<Frame> = selected.seen.iter().chain(predicted).cloned().collect();
     output.write(
         "prediction.gif",
-        &animation::enlarged_gif(&film, delay_ms).map_err(CliError::failed)?,
+        &animation::enlarged_gif(&film, spec.frame_period_s).map_err(CliError::failed)?,
     )
 }
 

@@ -51,6 +51,24 @@ pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
 }
 
 async fn listen(config: Config, has_default_admin: bool) -> Result<(), CliError> {
+    // From the beginning: as the first process of a container, the program would otherwise get no signal before it has started.
+    let mut shutdown = Box::pin(server::shutdown::requested());
+    let started = tokio::select! {
+        started = start(config, has_default_admin) => started?,
+        () = &mut shutdown => return Ok(()),
+    };
+    let (listeners, app) = started;
+    let store = app.store().clone();
+    server::serve(listeners, app, shutdown).await;
+    // From now on the database file alone is complete.
+    if let Err(error) = store.close().await {
+        warn!(%error, "could not close the store");
+    }
+    Ok(())
+}
+
+/// What is served, and where; prints the address.
+async fn start(config: Config, has_default_admin: bool) -> Result<(ServerListeners, App), CliError> {
     let tls = ServerTls::open(&config.server).map_err(|error| CliError::Usage(error.to_string()))?;
     let scheme = if tls.is_some() { "https" } else { "http" };
     let store = open_store_waiting(&config).await?;
@@ -69,21 +87,14 @@ async fn listen(config: Config, has_default_admin: bool) -> Result<(), CliError>
         .with_keys(keys)
         .with_tls(tls);
     report_models(&app);
-    let shutdown = server::shutdown::requested();
     print_line(format!(
         "Foreframe listens on {scheme}://{address}/ — press Ctrl-C to stop"
     ))?;
-    let store = app.store().clone();
     let listeners = ServerListeners {
         public: listener,
         admin,
     };
-    server::serve(listeners, app, shutdown).await;
-    // From now on the database file alone is complete.
-    if let Err(error) = store.close().await {
-        warn!(%error, "could not close the store");
-    }
-    Ok(())
+    Ok((listeners, app))
 }
 
 /// Logs the models that are served, or what to do if there are none.
@@ -116,7 +127,15 @@ async fn keys(config: &Config, store: Store) -> Result<Keys, CliError> {
     let is_required = config.is_exposed() && !config.insecure;
     let mut keys = Keys::open(store.clone(), is_required).await?;
     if is_required && keys.count() == 0 {
-        if !config.first_key || store.keys_were_created() || !store.list_keys().await?.is_empty() {
+        let had_keys = store.keys_were_created() || !store.list_keys().await?.is_empty();
+        if had_keys && config.first_key {
+            return Err(CliError::Usage(
+                "no API key is valid: keys were created here before, and first_key makes one only where there was none; create one with \
+                 foreframe keys create NAME and this data directory or database"
+                    .to_owned(),
+            ));
+        }
+        if !config.first_key || had_keys {
             return Err(CliError::Usage(format!(
                 "other machines can reach {}, but no valid API key exists; create one with foreframe keys create NAME, start with \
                  --set first_key=true to get a first one, bind a loopback address, or use --insecure",

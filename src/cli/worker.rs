@@ -45,13 +45,19 @@ pub(super) fn run(args: &WorkerArgs) -> Result<(), CliError> {
 
 /// `foreframe run-job`: the child process of a server or worker that runs one job.
 pub(super) fn run_job() -> Result<(), CliError> {
-    let _telemetry = telemetry::init(LogFormat::Text, None)?;
+    let format = std::env::var("FOREFRAME_LOG_FORMAT").is_ok_and(|format| format == "json");
+    let _telemetry = telemetry::init(if format { LogFormat::Json } else { LogFormat::Text }, None)?;
     child::run().map_err(CliError::Failed)
 }
 
 async fn work(config: &Config, has_default_admin: bool) -> Result<(), CliError> {
     let server = &config.server;
-    let store = open_store_waiting(config).await?;
+    // From the beginning: as the first process of a container, the program would otherwise get no signal before it has started.
+    let mut shutdown = Box::pin(crate::server::shutdown::requested());
+    let store = tokio::select! {
+        store = open_store_waiting(config) => store?,
+        () = &mut shutdown => return Ok(()),
+    };
     let versions = Versions::new(store.clone(), &server.models_dir);
     let jobs = start_jobs(server, &store, &versions, true).map_err(CliError::failed)?;
     let (stopping, is_stopping) = watch::channel(false);
@@ -65,7 +71,6 @@ async fn work(config: &Config, has_default_admin: bool) -> Result<(), CliError> 
         let (server, store) = (server.clone(), store.clone());
         tokio::spawn(async move { serve_worker_health(admin, &server, store, is_stopping).await })
     });
-    let shutdown = crate::server::shutdown::requested();
     print_line("Foreframe runs jobs — press Ctrl-C to stop")?;
     shutdown.await;
     info!("stopping");

@@ -131,7 +131,7 @@ settings! {
     max_requests: usize = 384, 1..=MAX_COUNT;
     /// Maximum number of streams; more are refused with 503.
     max_streams: usize = 128, 1..=MAX_COUNT;
-    /// Maximum number of event streams of jobs; more are refused with 503.
+    /// Maximum number of event streams, of jobs and of the server; more are refused with 503.
     max_event_streams: usize = 128, 1..=MAX_COUNT;
     /// Maximum number of simulated environments, and of world models as environments; see `environment_evict_ms`.
     max_environments: usize = 16, 1..=10_000;

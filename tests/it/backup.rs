@@ -99,7 +99,7 @@ async fn a_backup_of_a_stopped_server_holds_its_keys() {
     let keys = store.list_keys().await.unwrap();
     assert!(keys.len() == 1 && key.contains(&keys[0].id) && store.keys_were_created());
     let versions = store.published_versions().await.unwrap();
-    assert_eq!((versions[0].model.as_str(), versions[0].version), ("mine", 1));
+    assert_eq!((versions[0].0.as_str(), versions[0].1), ("mine", 1));
 }
 
 #[test]

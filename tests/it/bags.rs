@@ -388,6 +388,26 @@ fn damaged_messages_are_named_with_topic_and_place() {
 }
 
 #[test]
+fn an_episode_ends_at_a_damaged_image() {
+    let mut messages = drive(false);
+    let mut images = messages
+        .iter_mut()
+        .filter(|message| message.topic == "/camera/image_raw");
+    images.nth(6).unwrap().content.truncate(100);
+    let dir = tempfile::tempdir().unwrap();
+    let source = bag(dir.path(), "bad.mcap", &mcap(&messages, Chunks::None, 7));
+    let skipping = ImportOptions {
+        skip_bad: true,
+        ..options()
+    };
+    let out = dir.path().join("out");
+    run(&source, &out, skipping).unwrap();
+    let dataset = Dataset::open(&out).unwrap();
+    let lengths: Vec<usize> = dataset.episodes().iter().map(|episode| episode.frame_count).collect();
+    assert_eq!(lengths, [6, 13]);
+}
+
+#[test]
 fn a_missing_topic_lists_those_that_there_are() {
     let dir = tempfile::tempdir().unwrap();
     let source = bag(dir.path(), "drive.mcap", &mcap(&drive(false), Chunks::Lz4, 7));

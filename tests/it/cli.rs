@@ -489,6 +489,18 @@ fn every_command_finds_what_is_in_the_data_directory() {
         dir.path(),
         "evaluate --model mine --data-dir d --resamples 100 --windows 5 --save-scores --out r",
     );
+    succeed(
+        dir.path(),
+        "collect --data-dir d --trials 40 --frame-size 8 --seed 2 --name other",
+    );
+    let (code, text) = run(
+        dir.path(),
+        "evaluate --model mine --dataset other --data-dir d --save-scores --out r2",
+    );
+    assert!(
+        code == 2 && text.contains("has scores \"test\" of another data set"),
+        "{text}"
+    );
     let described = succeed(dir.path(), "inspect mine@1 --data-dir d");
     assert!(
         described.starts_with("d/models/mine/1 (mine version 1)") && described.contains("skill"),

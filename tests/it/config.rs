@@ -63,6 +63,15 @@ fn the_printed_configuration_is_a_valid_file() {
 }
 
 #[test]
+fn an_origin_that_no_page_has_is_refused() {
+    for wrong in ["robots.example", "https://robots.example/page", "*"] {
+        let message = refused(environment(&[("FOREFRAME_CORS_ORIGINS", &format!("[\"{wrong}\"]"))]));
+        let expected = format!("cors_origins holds \"{wrong}\" (environment FOREFRAME_CORS_ORIGINS); an origin is");
+        assert!(message.starts_with(&expected), "{message}");
+    }
+}
+
+#[test]
 fn every_limit_is_checked_against_its_range() {
     let defaults = Config::default().server;
     for (field, value, range) in defaults.bounds() {

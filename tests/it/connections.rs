@@ -223,7 +223,8 @@ async fn a_compressed_body_is_refused() {
 async fn other_origins_are_refused_unless_configured() {
     let dir = tempfile::tempdir().unwrap();
     let config = ServerConfig {
-        cors_origins: vec!["https://robots.example".to_owned()],
+        // As people write it.
+        cors_origins: vec!["https://Robots.example/".to_owned()],
         ..ServerConfig::default()
     };
     let app = app(dir.path(), config);

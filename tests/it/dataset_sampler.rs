@@ -137,6 +137,49 @@ fn recordings_of_unequal_length_are_split_by_time() {
 }
 
 #[test]
+fn a_long_episode_does_not_take_the_frames_for_training() {
+    let shape = WindowShape { context: 5, horizon: 5 };
+    let first = [vec![1560], vec![9; 15], vec![5]].concat();
+    let middle = [vec![9; 20], vec![1200, 40]].concat();
+    for lengths in [first, middle] {
+        let dataset = recorded(&lengths, &[]);
+        let splits = Splits::new(&dataset, Seed(3));
+        let windows = |split| splits.windows(&dataset, split, shape, 1).unwrap().len();
+        let all = dataset.info().frame_count;
+        assert!(windows(Split::Train) > all / 2, "{lengths:?}");
+        assert!((1..all / 5).contains(&windows(Split::Validation)), "{lengths:?}");
+        assert!((1..all / 5).contains(&windows(Split::Test)), "{lengths:?}");
+    }
+}
+
+#[test]
+fn a_test_part_of_episodes_too_short_for_a_window_takes_a_longer_one() {
+    let dataset = recorded(&[vec![400; 5], vec![9; 30]].concat(), &[]);
+    let splits = Splits::new(&dataset, Seed(3));
+    assert_eq!(splits.episodes(Split::Train), [0, 1, 2]);
+    assert_eq!(splits.episodes(Split::Validation), [3]);
+    assert_eq!(splits.episodes(Split::Test)[..2], [4, 5]);
+}
+
+#[test]
+fn three_periods_are_no_gap_whatever_the_last_bits_of_the_times_are() {
+    let dataset = recorded(&[40], &[]);
+    let mut late = episode(40, &[], None);
+    late.timestamps_s
+        .iter_mut()
+        .skip(20)
+        .for_each(|time_s| *time_s += 2.0 * PERIOD_S);
+    let with_step = Dataset::from_episodes(info(), vec![late]).unwrap();
+    let shape = WindowShape { context: 2, horizon: 1 };
+    let windows = |dataset| {
+        Splits::new(dataset, Seed(0))
+            .windows(dataset, Split::Train, shape, 1)
+            .unwrap()
+    };
+    assert_eq!(windows(&with_step), windows(&dataset));
+}
+
+#[test]
 fn a_single_recording_is_split_by_time() {
     let dataset = recorded(&[100], &[]);
     let splits = Splits::new(&dataset, Seed(0));

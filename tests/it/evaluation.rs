@@ -358,7 +358,7 @@ fn a_model_trained_elsewhere_has_a_second_skill() {
         second.skill.mean
     );
     assert!(
-        markdown.contains(&line) && markdown.contains("The model was not trained on this data set"),
+        markdown.contains(&line) && markdown.contains("This data set is not the one that the model was trained on."),
         "{markdown}"
     );
     let headline = &other.headline()["test"];

@@ -1,7 +1,9 @@
 //! Shared fixtures: a small data set in memory, and a model with random weights.
 
+use std::collections::BTreeSet;
 use std::path::Path;
 
+use foreframe_core::files::sha256_hex;
 use foreframe_core::nn::{Architecture, ChannelScale, Conditioning, DenseSpec, ModelSpec, Parameters};
 use foreframe_core::registry::{self, DatasetStamp, Manifest, Model, ProgramStamp};
 use foreframe_core::types::{Channel, Seed};
@@ -80,7 +82,16 @@ pub(crate) fn stamp(dataset: &Dataset) -> DatasetStamp {
         scenario: None,
         windows: 0,
         split_seed: Seed(7),
+        frame_marks: Vec::new(),
     }
+}
+
+/// The marks that a training on these frames keeps, if they are few.
+pub(crate) fn frame_marks(dataset: &Dataset, frames: impl IntoIterator<Item = usize>) -> Vec<u64> {
+    let mark = |frame: usize| u64::from_str_radix(&sha256_hex(&dataset.pixels(frame).unwrap())[..12], 16).unwrap();
+    let marks: BTreeSet<u64> = frames.into_iter().map(mark).collect();
+    assert!(marks.len() <= 512);
+    marks.into_iter().collect()
 }
 
 /// A model with random weights, published in `model_dir` and loaded from there.

@@ -244,6 +244,27 @@ fn arrays_of_one_file_become_frames_actions_and_states() {
 }
 
 #[test]
+fn arrays_of_any_numbers_are_read_and_colors_of_floats() {
+    let dir = tempfile::tempdir().unwrap();
+    let floats = |values: Vec<f32>| values.into_iter().flat_map(f32::to_le_bytes).collect::<Vec<u8>>();
+    let colors = (0..6).flat_map(|_| [1.0, 0.0, 0.0].repeat(16 * 12)).collect();
+    let times: Vec<u8> = (0..6u64).flat_map(|frame| (frame * 100).to_le_bytes()).collect();
+    let arrays: NamedArrays = vec![
+        ("frames", npy("<f4", "6, 12, 16, 3", &floats(colors))),
+        ("actions", npy("<f2", "6,", &[0x00, 0xbe].repeat(6))),
+        ("states", npy("|b1", "6,", &[1; 6])),
+        ("timestamps_ms", npy("<u8", "6,", &times)),
+    ];
+    let (source, out) = (dir.path().join("a.npz"), dir.path().join("out"));
+    npz(&source, &arrays, zip::CompressionMethod::Stored);
+    run(&source, &out, small()).unwrap();
+    let dataset = Dataset::open(&out).unwrap();
+    assert_eq!((dataset.info().frame_count, dataset.info().frame_period_s), (6, 0.1));
+    assert_eq!((dataset.action(2), dataset.state(2)), (&[-1.5f32][..], &[1.0f32][..]));
+    assert_eq!(dataset.pixels(4).unwrap()[0], 76);
+}
+
+#[test]
 fn wrong_arrays_of_a_file_are_named() {
     let dir = tempfile::tempdir().unwrap();
     let source = dir.path().join("a.npz");
@@ -369,6 +390,52 @@ fn damage_in_a_tub_is_named_or_skipped() {
     let (text, skipped) = damaged(|tub| rewrite(tub, "\"user/angle\":0.6", "\"user/angle\":null"));
     assert!(text.contains("line 7") && text.contains("user/angle"), "{text}");
     assert_eq!(skipped, 1);
+}
+
+/// The lengths of the data set's episodes.
+fn lengths(set: &Path) -> Vec<usize> {
+    let dataset = Dataset::open(set).unwrap();
+    dataset.episodes().iter().map(|episode| episode.frame_count).collect()
+}
+
+#[test]
+fn an_episode_ends_at_what_is_left_out() {
+    let dir = tempfile::tempdir().unwrap();
+    let skipping = ImportOptions {
+        skip_bad: true,
+        ..small()
+    };
+    let (walk, car) = (folder(dir.path()), tub(dir.path()));
+    let rewrite = |path: PathBuf, from: &str, to: &str| {
+        let text = fs::read_to_string(&path).unwrap();
+        assert!(text.contains(from));
+        fs::write(path, text.replacen(from, to, 1)).unwrap();
+    };
+    rewrite(walk.join("log.csv"), ",0.3,", ",NaN,");
+    run(&walk, &dir.path().join("a"), skipping.clone()).unwrap();
+    assert_eq!(lengths(&dir.path().join("a")), [3, 4, 4]);
+    rewrite(
+        car.join("catalog_0.catalog"),
+        "\"user/angle\":0.6",
+        "\"user/angle\":null",
+    );
+    rewrite(car.join("manifest.json"), "[9]", "[2]");
+    run(&car, &dir.path().join("b"), skipping).unwrap();
+    assert_eq!(lengths(&dir.path().join("b")), [2, 3, 3]);
+}
+
+#[test]
+fn columns_of_a_single_action_and_state_need_no_suffix() {
+    let dir = tempfile::tempdir().unwrap();
+    let source = folder(dir.path());
+    let text = fs::read_to_string(source.join("log.csv")).unwrap();
+    let text = text.replace("action.speed", "action").replace("state.heading", "state");
+    fs::write(source.join("log.csv"), text).unwrap();
+    // What macOS writes beside a file on a foreign disk.
+    fs::write(source.join("._log.csv"), b"\0\x05\x16\x07").unwrap();
+    let info = run(&source, &dir.path().join("out"), small()).unwrap().info;
+    assert_eq!(info.action_channels[0].to_string(), "action m/s");
+    assert_eq!(info.state_channels[0].to_string(), "state");
 }
 
 #[test]

@@ -32,6 +32,7 @@ mod evaluation_parts;
 mod evaluation_ranking;
 mod export_mcap;
 mod fixtures;
+mod frame_marks;
 mod goal_image;
 mod healthy_robot;
 mod import;

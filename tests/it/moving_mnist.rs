@@ -291,7 +291,7 @@ fn a_model_is_trained_and_scored_as_papers_do() {
     let report = evaluation::run(&loaded, &other, &whole, &|_| {}).unwrap();
     let figures = evaluation::draw_figures(&loaded, &other, &report).unwrap();
     assert!(figures.iter().any(|figure| figure.about.file == "prediction.gif"));
-    let scores = report.scores("test").unwrap();
+    let scores = report.scores("whole-set").unwrap();
     assert_eq!((scores.windows, scores.blocks), (12, Some(12)));
     for row in &scores.methods {
         let benchmark = row.benchmark.as_ref().unwrap();
@@ -300,7 +300,12 @@ fn a_model_is_trained_and_scored_as_papers_do() {
     }
     let has = |method| scores.methods.iter().any(|row| row.method == method);
     assert!(has(Method::Black) && !has(Method::NearestWindows));
-    assert!(report.to_markdown().contains("Squared error, sum over a frame"));
+    let markdown = report.to_markdown();
+    assert!(markdown.contains("Squared error, sum over a frame"));
+    assert!(
+        !markdown.contains(Method::CodecOnly.label()),
+        "it draws no frame through a codec"
+    );
     let error = evaluation::run(&loaded, &seen, &whole, &|_| {})
         .unwrap_err()
         .to_string();

@@ -74,6 +74,7 @@ pub(crate) fn model(dir: &Path, name: &str, spec: ModelSpec) -> Model {
         scenario: None,
         windows: 1,
         split_seed: Seed(0),
+        frame_marks: Vec::new(),
     };
     fixtures::model(&dir.join(name), name, spec, trained_on)
 }

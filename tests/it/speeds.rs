@@ -239,21 +239,45 @@ fn the_shipped_rooms_predicts_frames_of_which_nothing_is_told() {
 }
 
 #[test]
+fn a_frame_after_one_without_a_state_is_predicted_as_if_only_its_own_were_known() {
+    let models = Path::new(env!("CARGO_MANIFEST_DIR")).join("models");
+    let model = Arc::new(registry::load(&models.join("rooms")).unwrap());
+    let state = |index: usize| RobotState::try_from(vec![0.1 * index as f32, 0.0, 1.0, 0.0, 0.5, 0.0]).unwrap();
+    let predicted = |has_state: &dyn Fn(usize) -> bool| {
+        let mut session = Session::new(Arc::clone(&model));
+        let mut predicted = None;
+        for index in 0..8 {
+            let state = Some(state(index)).filter(|_| has_state(index));
+            predicted = session.step(wavy_frame(index), state.as_ref(), None).unwrap();
+        }
+        predicted.unwrap().frames
+    };
+    assert_eq!(predicted(&|index| index != 6), predicted(&|index| index == 7));
+    assert_ne!(predicted(&|_| true), predicted(&|index| index == 7));
+}
+
+/// A frame of waves, which wander to the left.
+fn wavy_frame(index: usize) -> Frame {
+    let pixel = |at: usize| (100.0 + 80.0 * ((at % 64 + 3 * index) as f32 * 0.4).sin()) as u8;
+    Frame::new(64, 64, (0..64 * 64).map(pixel).collect()).unwrap()
+}
+
+#[test]
 fn a_session_continues_elsewhere_without_states_and_forgets_those_before_a_gap() {
     let models = Path::new(env!("CARGO_MANIFEST_DIR")).join("models");
     let model = Arc::new(registry::load(&models.join("rooms")).unwrap());
-    let frame = |index: usize| {
-        let pixel = |at: usize| (100.0 + 80.0 * ((at % 64 + 3 * index) as f32 * 0.4).sin()) as u8;
-        Frame::new(64, 64, (0..64 * 64).map(pixel).collect()).unwrap()
-    };
     let mut session = Session::new(Arc::clone(&model));
     let mut predicted = None;
     for index in 0..5 {
-        predicted = session.step(frame(index), None, None).unwrap();
+        predicted = session.step(wavy_frame(index), None, None).unwrap();
     }
     assert_eq!(predicted.unwrap().frames.len(), 5);
     let mut again = Session::restore(model, session.snapshot()).unwrap();
-    let next = [session.step(frame(5), None, None), again.step(frame(5), None, None)].map(Result::unwrap);
+    let next = [
+        session.step(wavy_frame(5), None, None),
+        again.step(wavy_frame(5), None, None),
+    ]
+    .map(Result::unwrap);
     let [here, elsewhere] = next.map(|rollout| rollout.expect("a session without a prediction is a bug"));
     assert_eq!((here.frames, here.novelty), (elsewhere.frames, elsewhere.novelty));
     // Only here, the frame is compared with what was predicted of it.
@@ -261,10 +285,10 @@ fn a_session_continues_elsewhere_without_states_and_forgets_those_before_a_gap()
 
     let state = RobotState::try_from(vec![0.0, 0.0, 1.0, 0.0, 0.2, 0.0]).unwrap();
     for index in 6..9 {
-        session.step(frame(index), Some(&state), None).unwrap();
+        session.step(wavy_frame(index), Some(&state), None).unwrap();
     }
     assert_eq!(session.snapshot().past_states.len(), 2);
-    session.step(frame(9), None, None).unwrap();
-    session.step(frame(10), Some(&state), None).unwrap();
+    session.step(wavy_frame(9), None, None).unwrap();
+    session.step(wavy_frame(10), Some(&state), None).unwrap();
     assert!(session.snapshot().past_states.is_empty());
 }

@@ -380,7 +380,7 @@ async fn versions_are_numbered_after_the_shipped_one() {
                 .unwrap()
         );
         let listed = store.published_versions().await.unwrap();
-        assert_eq!(listed.iter().map(|row| row.version).collect::<Vec<_>>(), [5, 6]);
+        assert_eq!(listed, [(model(), 5), (model(), 6)]);
         let entries = store.audit(None, 10).await.unwrap();
         let published = entries.iter().filter(|entry| entry.action == "version.publish");
         assert_eq!(

@@ -460,6 +460,26 @@ fn a_diverging_run_keeps_its_last_good_checkpoint() {
 }
 
 #[test]
+fn a_validation_error_that_is_no_number_ends_the_training() {
+    let (dataset, dir) = (squares(20), tempfile::tempdir().unwrap());
+    let settings = [
+        "name=square",
+        "data.windows=40",
+        "data.validation_windows=4",
+        "sequence.steps=1",
+        "sequence.batch_size=4",
+        "sequence.learning_rate=1",
+        "model.flow={ channels = 8, stem_channels = 6, enlarged_channels = 3, fine_channels = 5, scene_hidden = 8 }",
+        "run.clip_norm=1e6",
+        "run.warmup_steps=0",
+    ];
+    let config = TrainConfig::layered("moving-flow", None, &settings.map(str::to_owned)).unwrap();
+    let error = train(&config, &dataset, dir.path()).unwrap_err().to_string();
+    assert!(error.contains("at step 1: the validation loss is"), "{error}");
+    assert!(!dir.path().join("model").exists());
+}
+
+#[test]
 fn a_run_with_other_settings_or_data_is_not_resumed() {
     let (dataset, dir) = (squares(20), tempfile::tempdir().unwrap());
     train_until(&small_config(&[]), &dataset, dir.path(), 3).unwrap();
@@ -471,27 +491,6 @@ fn a_run_with_other_settings_or_data_is_not_resumed() {
         .unwrap_err()
         .to_string();
     assert!(error.contains("holds a run with another data set"), "{error}");
-}
-
-#[test]
-fn a_run_or_model_with_the_old_settings_is_refused_with_their_new_name() {
-    let (dataset, dir) = (squares(20), tempfile::tempdir().unwrap());
-    train_until(&small_config(&[]), &dataset, dir.path(), 3).unwrap();
-    let config = dir.path().join("config.toml");
-    let text = std::fs::read_to_string(&config).unwrap();
-    std::fs::write(&config, text.replace("[sequence]", "[fit]")).unwrap();
-    let error = train(&small_config(&[]), &dataset, dir.path()).unwrap_err();
-    assert!(
-        error.to_string().starts_with("`fit` is now called `sequence`"),
-        "{error}"
-    );
-
-    let mut manifest = registry::manifest::read(std::path::Path::new("models/paper")).unwrap();
-    let settings = manifest.training.as_object_mut().unwrap();
-    let sequence = settings.remove("sequence").unwrap();
-    settings.insert("fit".to_owned(), sequence);
-    let error = TrainConfig::of_model(&manifest, []).unwrap_err();
-    assert_eq!(error.to_string(), "`fit` is now called `sequence` (model paper)");
 }
 
 #[test]

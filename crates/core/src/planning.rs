@@ -27,7 +27,7 @@ pub use error::PlanError;
 pub use goal::Goal;
 pub use judge::PlannerInput;
 pub use limits::{ActionLimit, ActionLimits};
-pub use local::{PlanContext, plan, plan_around};
+pub use local::{plan, plan_around};
 pub use obstacles::Obstacles;
 pub use planner::{PlanBatch, Planner};
 pub use settings::{PlanSettings, SolverKind, SolverSettings};

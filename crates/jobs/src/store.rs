@@ -33,7 +33,7 @@ pub use self::job_id::{JobId, JobIdError};
 pub use self::job_rows::{EnqueueResult, JobCount, JobOutcome, JobPage, JobRow, NewJob};
 pub use self::keys::{KeyRow, KeyScope};
 pub use self::lease::Lease;
-pub use self::models::{ModelMetrics, PublishedVersion, VersionRow};
+pub use self::models::{ModelMetrics, PublishedVersion};
 pub use self::objects::Objects;
 pub use self::parts::PartCounts;
 pub use self::reports::{JobReport, LogRow, LossRow};

@@ -159,8 +159,8 @@ impl Versions {
         for (model, _) in registry::list(&self.shipped_dir)? {
             all.entry(model.clone()).or_default().extend(self.shipped(&model));
         }
-        for row in self.store.published_versions().await? {
-            all.entry(row.model).or_default().insert(row.version);
+        for (model, version) in self.store.published_versions().await? {
+            all.entry(model).or_default().insert(version);
         }
         let sorted = |(model, versions): (ModelName, BTreeSet<u32>)| (model, versions.into_iter().collect());
         Ok(all.into_iter().map(sorted).collect())

@@ -47,6 +47,8 @@ pub use self::calibrate::{calibrate, calibrate_trained};
 #[doc(hidden)]
 pub use self::camera_estimate::{CameraEstimate, estimate_camera};
 pub use self::compatible::check_fit;
+#[doc(hidden)]
+pub use self::compatible::check_saving;
 pub use self::config::{EvaluateConfig, NEAREST_WINDOWS, ScoredSplit};
 #[doc(hidden)]
 pub use self::division::EvaluationPart;
@@ -75,7 +77,6 @@ use foreframe_core::types::Seed;
 use foreframe_data::dataset::moving_mnist::MOVING_MNIST;
 use foreframe_data::dataset::sampler::{Split, Splits};
 use foreframe_data::dataset::{Dataset, Window};
-use foreframe_sim::RoomSet;
 
 /// What a part saves of how the nearest windows are weighed, which takes as long as scoring hundreds of windows.
 const NEAREST: &str = "nearest-windows";
@@ -83,7 +84,7 @@ const NEAREST: &str = "nearest-windows";
 /// Scores the model on the splits that [`EvaluateConfig::split`] names: the validation split, the three test sets
 /// (trials, start/goal pairs and gains that training never saw), or the whole data set. Rooms that are only for tests are
 /// scored as a whole. Errors: model and data set that don't fit together, settings out of range, nothing held out,
-/// `TrainedOn`, `Cancelled`, those of the network.
+/// `TrainedOn`, `TrainedOnFrames`, `Cancelled`, those of the network.
 pub fn run(
     loaded: &Model,
     dataset: &Dataset,
@@ -102,9 +103,8 @@ pub fn run(
     for &split in *tests {
         evaluation.split = split;
         let (outcome, novelty) = score_split(&evaluation, splits, &baselines)?;
-        let rooms = config::test_rooms(dataset).filter(|_| config.split == ScoredSplit::WholeSet);
         sets.push(SetReport {
-            split: rooms.map_or(split.name(), RoomSet::name).to_owned(),
+            split: config.split.set_name(dataset, split).to_owned(),
             outcome,
         });
         // Other data sets are compared with the first set that was scored.
@@ -170,7 +170,8 @@ struct HeldOut<'a> {
 }
 
 impl<'a> HeldOut<'a> {
-    /// Errors: model, twins and data set that don't fit together, settings out of range, nothing held out, `TrainedOn`.
+    /// Errors: model, twins and data set that don't fit together, settings out of range, nothing held out, `TrainedOn`,
+    /// `TrainedOnFrames`.
     fn of(loaded: &Model, dataset: &Dataset, config: &EvaluateConfig<'a>) -> Result<Self, EvaluationError> {
         config.validate()?;
         compatible::check(loaded, dataset)?;
@@ -184,9 +185,6 @@ impl<'a> HeldOut<'a> {
             split: config.split.of(loaded, dataset),
             ..config.clone()
         };
-        if config.split == ScoredSplit::WholeSet {
-            compatible::check_untrained(loaded, dataset)?;
-        }
         let splits = config.split.divide(dataset, split_seed);
         let mut tests = config.split.splits();
         if is_recording(dataset) {
@@ -198,6 +196,11 @@ impl<'a> HeldOut<'a> {
                 dataset: dataset.info().name.clone(),
                 split_seed: split_seed.0,
             });
+        }
+        if config.split == ScoredSplit::WholeSet {
+            let windows = splits.windows(dataset, Split::Test, window_shape(loaded.spec()), config.stride)?;
+            let scored = evenly(&windows, config.max_windows);
+            compatible::check_untrained(loaded, dataset, &scored)?;
         }
         Ok(Self {
             config,
@@ -294,5 +297,11 @@ fn score_split(
     let measured = Measurements::of(evaluation, &windows, baselines)?;
     let (mut scores, novelty) = measured.scores(evaluation, &windows, baselines);
     scores.windows_available = available.len();
+    scores.frames_of_training =
+        compatible::frames_of_training(evaluation.inference.loaded, evaluation.inference.dataset, &windows)?;
+    if scores.has_frames_of_training() {
+        // It would be read as the skill on data that the model never saw.
+        scores.skill_against_unfitted = None;
+    }
     Ok((SetOutcome::Scored(Box::new(scores)), novelty))
 }

@@ -51,16 +51,6 @@ pub enum SettingsError {
         /// The command that lists all settings.
         listing: &'static str,
     },
-    /// The setting has another name now.
-    #[error("`{old}` is now called `{new}` ({origin})")]
-    Renamed {
-        /// Its old name.
-        old: &'static str,
-        /// Its name.
-        new: &'static str,
-        /// Where it was given.
-        origin: String,
-    },
     /// The value is of the wrong kind.
     #[error("{key} is {found} ({origin}); it must be {expected}")]
     Type {
@@ -109,10 +99,13 @@ impl SettingsLayer {
         }
     }
 
-    /// One value as text: a TOML value, or else a string.
+    /// One value as text: a TOML value, or else a string, as a name always is: also one of digits only.
     #[must_use]
     pub fn text(origin: impl Into<String>, key: &str, text: &str) -> Self {
-        let value = toml_value(text).and_then(|value| Value::serialize(value).ok());
+        let value = Some(text)
+            .filter(|_| key != "name")
+            .and_then(toml_value)
+            .and_then(|value| Value::serialize(value).ok());
         Self::value(origin, key, value.unwrap_or_else(|| Value::from(text.trim())))
     }
 
@@ -183,15 +176,6 @@ impl SettingsLayer {
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.values.is_empty()
-    }
-
-    /// Errors: `Renamed` if the top level has the old name of a setting.
-    pub fn refuse_renamed(&self, old: &'static str, new: &'static str) -> Result<(), SettingsError> {
-        if !self.values.contains_key(old) {
-            return Ok(());
-        }
-        let origin = self.origin.clone();
-        Err(SettingsError::Renamed { old, new, origin })
     }
 
     /// The names of the top level, sorted.
@@ -325,12 +309,22 @@ fn expected_kind(kind: &Kind) -> String {
 
 #[cfg(test)]
 mod tests {
+    use serde_json::json;
+
     use super::*;
 
     fn merged(layers: &[&str]) -> Result<LayeredSettings, SettingsError> {
         let defaults = SettingsLayer::toml("default", "size = 1\n[sequence]\nrate = 1e-3\nname = \"a\"\n")?;
         let layers: Result<Vec<_>, _> = layers.iter().map(|text| SettingsLayer::assignment(text)).collect();
         LayeredSettings::merge(defaults, layers?, "the program")
+    }
+
+    #[test]
+    fn a_name_of_digits_is_text() {
+        for (key, expected) in [("name", json!("20241130")), ("seed", json!(20_241_130))] {
+            let layer = SettingsLayer::assignment(&format!("{key}=20241130")).unwrap();
+            assert_eq!(serde_json::to_value(&layer.values[key]).unwrap(), expected, "{key}");
+        }
     }
 
     #[test]

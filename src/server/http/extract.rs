@@ -22,7 +22,7 @@ pub(super) const MSGPACK: &str = "application/msgpack";
 pub(in crate::server) struct Json<T>(pub(in crate::server) T);
 
 /// A value that is an object.
-pub(super) struct Object<T>(pub(super) T);
+pub(in crate::server) struct Object<T>(pub(in crate::server) T);
 
 impl<'de, T: Deserialize<'de>> Deserialize<'de> for Object<T> {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {

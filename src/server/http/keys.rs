@@ -90,8 +90,6 @@ struct KnownKeys {
     valid: HashMap<TokenHash, Arc<KnownKey>>,
     /// Whether the store has any key, revoked or not.
     exist: bool,
-    /// Keys that an older version stored in a form that is no longer accepted.
-    outdated: usize,
     /// The store's clock when they were read, and when that was: this machine's clock can be wrong, and can jump.
     read_s: f64,
     read_at: Instant,
@@ -146,7 +144,6 @@ impl Keys {
         let known = KnownKeys {
             valid: HashMap::new(),
             exist: false,
-            outdated: 0,
             read_s: 0.0,
             read_at: Instant::now(),
         };
@@ -171,9 +168,11 @@ impl Keys {
         let (read_s, read_at) = (store.now_s().await?, Instant::now());
         rows.retain(|row| row.is_valid(read_s));
         self.known.send_modify(|known| {
-            let (count, mut valid) = (rows.len(), HashMap::new());
+            let mut valid = HashMap::new();
             for row in rows {
-                let Some(hash) = TokenHash::from_hex(&row.hash) else { continue };
+                let Some(hash) = TokenHash::from_hex(&row.hash) else {
+                    continue;
+                };
                 // A key that has not changed keeps what was used of its rate.
                 let before = known.valid.get(&hash).filter(|before| before.row == row).cloned();
                 let fresh = || {
@@ -182,18 +181,9 @@ impl Keys {
                 };
                 valid.insert(hash, before.unwrap_or_else(fresh));
             }
-            let outdated = count - valid.len();
-            if outdated > known.outdated {
-                warn!(
-                    keys = outdated,
-                    "some API keys were made by an older version and are no longer accepted; create new ones with foreframe \
-                     keys create, and revoke the old ones"
-                );
-            }
             *known = KnownKeys {
                 valid,
                 exist,
-                outdated,
                 read_s,
                 read_at,
             };

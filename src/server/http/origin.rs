@@ -9,7 +9,7 @@ use std::sync::Arc;
 
 use axum::extract::{Request, State};
 use axum::http::uri::Authority;
-use axum::http::{HeaderValue, Method, StatusCode, Version, header};
+use axum::http::{HeaderValue, Method, StatusCode, Uri, Version, header};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 
@@ -21,6 +21,14 @@ const METHODS: HeaderValue = HeaderValue::from_static("GET, POST, DELETE");
 const HEADERS: HeaderValue =
     HeaderValue::from_static("authorization, content-type, idempotency-key, x-request-id, x-session-token");
 
+/// Whether a text is the origin of a web page.
+pub(crate) fn is_origin(text: &str) -> bool {
+    text.parse::<Uri>().is_ok_and(|uri| {
+        let is_web = matches!(uri.scheme_str(), Some("http" | "https"));
+        is_web && uri.authority().is_some() && uri.path_and_query().is_none_or(|rest| rest == "/")
+    })
+}
+
 /// The origins that may call, and whether hosts are checked.
 #[derive(Clone)]
 pub(in crate::server) struct OriginPolicy {
@@ -31,7 +39,12 @@ pub(in crate::server) struct OriginPolicy {
 impl OriginPolicy {
     pub(in crate::server) fn new(config: &ServerConfig, keys: Keys) -> Self {
         Self {
-            allowed: config.cors_origins.as_slice().into(),
+            // As browsers write them.
+            allowed: config
+                .cors_origins
+                .iter()
+                .map(|origin| origin.trim_end_matches('/').to_ascii_lowercase())
+                .collect(),
             keys,
         }
     }

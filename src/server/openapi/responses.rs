@@ -60,7 +60,7 @@ fn describe_parameters(resource: &str, operation: &mut Operation) {
             ("environments", "id") => "The environment's id",
             ("jobs", "id") => "The job's id",
             ("jobs", "file") => "The file's name",
-            ("sessions", "id") => "The session's id",
+            ("sessions" | "realtime", "id") => "The session's id",
             ("sessions", "token") => "The session's token; or as header `x-session-token`",
             ("sessions", "x-session-token") => "The session's token; or as query parameter `token`",
             _ => continue,
@@ -93,6 +93,7 @@ fn add_common_errors(resource: &str, operation: &mut Operation) {
             )],
             "jobs" => vec![("404", "No such job")],
             "sessions" => vec![("404", "No such session"), ("410", "It has expired")],
+            "realtime" => vec![("404", "No such session")],
             _ => Vec::new(),
         });
         if are_numbers.contains(&true) {

@@ -8,14 +8,14 @@ use metrics::{counter, histogram};
 use crate::server::blocking::BlockingWork;
 use crate::server::http::problem::ApiError;
 use foreframe_core::metric_names;
-use foreframe_core::planning::{PlanBatch, PlanChoice, PlanContext, PlanError, Planner, PlannerInput};
+use foreframe_core::planning::{PlanBatch, PlanChoice, PlanError, Planner, PlannerInput};
 use foreframe_core::registry::Model;
 use foreframe_core::serving::{ConditioningInput, Prediction, Predictor, Task};
 
 /// A search that has not run.
 pub(in crate::server) struct PlanTask {
     pub(in crate::server) model: Arc<Model>,
-    pub(in crate::server) context: PlanContext,
+    pub(in crate::server) context: Task,
     /// The session's number in the predictor.
     pub(in crate::server) session: Option<u64>,
     pub(in crate::server) begun: Instant,
@@ -53,7 +53,7 @@ impl PlanTask {
             let Some(batch) = batch else { break };
             let asked = Instant::now();
             let inputs = ConditioningInput::of_plans(batch.plans, state.clone(), Some(steps), &self.model.manifest)?;
-            let task = self.context.task(inputs, batch.sees_occupancy);
+            let task = self.context.with_rollouts(inputs, batch.sees_occupancy);
             let Some(prediction) = self.predict(predictor, task, budget).await? else {
                 break;
             };

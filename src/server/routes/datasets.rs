@@ -160,7 +160,7 @@ async fn animation(app: App, Path((name, episode)): Path<(String, usize)>) -> Re
     let name = dataset_name(&app, &name).await?;
     let gif = episode_picture(&app, &name, episode, "gif", |mut frames, period_s| {
         frames.truncate(MAX_ANIMATED);
-        enlarged_gif(&frames, picture::delay_ms(period_s))
+        enlarged_gif(&frames, period_s)
     });
     Ok(([(header::CONTENT_TYPE, "image/gif")], gif.await?))
 }

@@ -103,9 +103,7 @@ impl ServerEventStream {
         for manifest in self.app.predictor().models() {
             (manifest.name.as_str(), manifest.version).hash(&mut hasher);
         }
-        for published in store.published_versions().await.ok()? {
-            (published.model.as_str(), published.version).hash(&mut hasher);
-        }
+        store.published_versions().await.ok()?.hash(&mut hasher);
         for measured in store.model_metrics().await.ok()? {
             (measured.model.as_str(), measured.version, measured.metrics).hash(&mut hasher);
         }

@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 use axum::http::header;
 use axum::response::IntoResponse;
 use metrics::gauge;
+use tokio::time::timeout;
 use tracing::warn;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
@@ -20,6 +21,8 @@ use crate::telemetry;
 pub(in crate::server) const TEXT_FORMAT: &str = "text/plain; version=0.0.4; charset=utf-8";
 /// How often the samples of histograms are sorted into their buckets.
 const FOLD_INTERVAL: Duration = Duration::from_secs(5);
+/// How long the store may take to count the jobs: who reads metrics waits only for some seconds.
+const COUNT_LIMIT: Duration = Duration::from_secs(1);
 
 pub(in crate::server) fn routes() -> OpenApiRouter<App> {
     OpenApiRouter::new().routes(routes!(metrics))
@@ -37,12 +40,13 @@ async fn metrics(app: App) -> impl IntoResponse {
     ([(header::CONTENT_TYPE, TEXT_FORMAT)], text(app.store()).await)
 }
 
-/// All metrics as text, with the jobs of this store.
+/// All metrics as text, with the jobs of this store; if it does not answer soon, with those that were counted last. The other metrics
+/// are still useful then.
 pub(in crate::server) async fn text(store: &Store) -> String {
-    match store.count_jobs().await {
-        Ok(counts) => measure_jobs(&counts),
-        // The other metrics are still useful.
-        Err(error) => warn!(%error, "could not count the jobs"),
+    match timeout(COUNT_LIMIT, store.count_jobs()).await {
+        Ok(Ok(counts)) => measure_jobs(&counts),
+        Ok(Err(error)) => warn!(%error, "could not count the jobs"),
+        Err(_) => warn!("could not count the jobs: the store does not answer"),
     }
     telemetry::render()
 }

@@ -139,12 +139,7 @@ fn film(frames: impl Iterator<Item = Result<Frame, FrameError>>, period_s: f64) 
     let mut frames: Vec<Frame> = frames.collect::<Result<_, _>>()?;
     let last = frames.last().cloned();
     frames.extend(last.into_iter().flat_map(|last| vec![last; REST_PERIODS]));
-    codec::encode_gif(&frames, delay_ms(period_s))
-}
-
-/// How long an animation shows each frame.
-pub(super) fn delay_ms(period_s: f64) -> u32 {
-    (period_s * 1000.0).clamp(20.0, 10_000.0) as u32
+    codec::encode_gif(&frames, period_s)
 }
 
 #[cfg(test)]

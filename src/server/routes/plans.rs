@@ -21,7 +21,6 @@ use crate::server::plans::response::{PlanForm, PlanResponse};
 use crate::server::plans::search::{ChosenPlan, PlanTask};
 use crate::server::state::App;
 use foreframe_core::frame::Frame;
-use foreframe_core::planning::PlanContext;
 
 pub(in crate::server) fn routes() -> OpenApiRouter<App> {
     OpenApiRouter::new()
@@ -108,7 +107,7 @@ async fn session_plan(
         wanted,
         body: request.form(),
     };
-    let context = PlanContext::new(state.rollout_task(Vec::new(), model.spec()));
+    let context = state.rollout_task(Vec::new(), model.spec());
     let (manifest, config) = (Arc::clone(&model.manifest), Arc::clone(&app.config));
     let decode = move || request.into_input(&state, settings.resize, &manifest, &config);
     let input = app.predictions.run(decode).await??;

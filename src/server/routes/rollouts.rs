@@ -129,6 +129,7 @@ async fn model_rollouts(
     BodyOrForm(request): BodyOrForm<RolloutRequest>,
 ) -> Result<Response, ApiError> {
     let model = app.predictor().active(&model)?;
+    let _place = app.admission.enter()?;
     let (manifest, format, config) = (Arc::clone(&model.manifest), request.format, Arc::clone(&app.config));
     let decode = move || request.into_task(wanted, &manifest, &config);
     let (seen, task) = app.predictions.run(decode).await??;
@@ -166,10 +167,15 @@ async fn session_rollouts(
             "the session has {have} of the {need} frames that a prediction takes; send more frames"
         )));
     }
-    let (_, given) = request_inputs::states(request.state, None, 0)?;
-    let robot_state = given.or_else(|| state.robot_state().cloned());
-    let inputs = conditioning(request.plans, request.steps, robot_state, &model.manifest, app.config())?;
-    let task = state.rollout_task(inputs, model.spec());
+    let _place = app.admission.enter()?;
+    let (manifest, config) = (Arc::clone(&model.manifest), Arc::clone(&app.config));
+    let check = move || {
+        let (_, given) = request_inputs::states(request.state, None, 0)?;
+        let robot_state = given.or_else(|| state.robot_state().cloned());
+        let inputs = conditioning(request.plans, request.steps, robot_state, &manifest, &config)?;
+        Ok::<_, ApiError>(state.rollout_task(inputs, &manifest.spec))
+    };
+    let task = app.predictions.run(check).await??;
     let prediction = app.predictor().compute(&model, task, Some(session.key)).await?;
     let encode = move || answer(wanted, format, &[], prediction);
     picture::threads_for(&app, wanted).run(encode).await?

@@ -15,7 +15,7 @@ use crate::server::plans::response::PlanResponse;
 use crate::server::plans::search::PlanTask;
 use foreframe_core::error_text::without_middle;
 use foreframe_core::frame::resize::Resize;
-use foreframe_core::planning::{PlanContext, Planner};
+use foreframe_core::planning::Planner;
 use foreframe_core::serving::SessionState;
 use foreframe_core::types::RobotState;
 
@@ -170,7 +170,7 @@ impl DuePlan {
     async fn answer(self, session: &Session, services: &StreamServices) -> Result<Box<PlanResponse>, ApiError> {
         let (model, begun, form) = (Arc::clone(&session.model), self.begun, self.request.form());
         let task = PlanTask {
-            context: PlanContext::new(self.state.rollout_task(Vec::new(), model.spec())),
+            context: self.state.rollout_task(Vec::new(), model.spec()),
             model: Arc::clone(&model),
             session: Some(session.key),
             begun,

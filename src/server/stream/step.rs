@@ -71,7 +71,7 @@ impl StepConditions {
         max_steps: usize,
     ) -> Result<ConditioningInput, StepError> {
         let limit = max_steps.max(manifest.spec.horizon);
-        if let Some(found) = self.steps.filter(|steps| *steps > limit) {
+        if let Some(found) = self.steps.filter(|steps| !(1..=limit).contains(steps)) {
             return Err(StepError::Invalid(format!(
                 "steps is {found}; this server predicts 1 to {limit}"
             )));

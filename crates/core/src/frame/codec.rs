@@ -3,9 +3,8 @@
 use std::io::Cursor;
 
 use image::codecs::gif::{GifEncoder, Repeat};
-use image::{
-    DynamicImage, ExtendedColorType, GrayImage, ImageDecoder as _, ImageEncoder, ImageFormat, ImageReader, Limits,
-};
+use image::metadata::Orientation;
+use image::{DynamicImage, ExtendedColorType, GrayImage, ImageDecoder, ImageEncoder, ImageFormat, ImageReader, Limits};
 
 use super::{Frame, FrameError, FrameSize, MAX_SIDE_PX, jpeg};
 
@@ -14,32 +13,64 @@ const MAX_METADATA_BYTES: u64 = 1 << 20;
 /// Largest pixel format, in bytes: four channels of 16 bits.
 const MAX_PIXEL_BYTES: u64 = 8;
 
-/// Reads a PNG or JPEG image and converts it to gray. Errors: `Size` if a side is larger than [`MAX_SIDE_PX`]; `Decode` if
-/// the bytes are not PNG or JPEG; `Damaged` for a JPEG image whose data is incomplete or not valid.
+/// Reads a PNG or JPEG image and converts it to gray. A JPEG image is turned as its EXIF data says. Errors: `Size` if a side is
+/// larger than [`MAX_SIDE_PX`]; `Decode` if the bytes are not PNG or JPEG; `Damaged` for a JPEG image whose data is incomplete or
+/// not valid.
 pub fn decode(bytes: &[u8]) -> Result<Frame, FrameError> {
-    let FrameSize { width, height } = dimensions(bytes)?;
+    let sides = reader(bytes, MAX_METADATA_BYTES)?.into_dimensions();
+    let (width, height) = sides.map_err(FrameError::Decode)?;
     if width.max(height) > MAX_SIDE_PX {
         return Err(FrameError::Size { width, height });
     }
     // The decoder fills what is missing with gray.
-    if bytes.starts_with(&[0xff, 0xd8]) {
+    if is_jpeg(bytes) {
         jpeg::check(bytes).map_err(|damage| FrameError::Damaged(damage.into()))?;
     }
     let pixel_bytes = u64::from(width) * u64::from(height) * MAX_PIXEL_BYTES;
-    let image = reader(bytes, pixel_bytes + MAX_METADATA_BYTES)?.decode();
-    let pixels = match image.map_err(FrameError::Decode)? {
+    let reader = reader(bytes, pixel_bytes + MAX_METADATA_BYTES)?;
+    let mut decoder = reader.into_decoder().map_err(FrameError::Decode)?;
+    let orientation = orientation(bytes, &mut decoder)?;
+    let mut image = DynamicImage::from_decoder(decoder).map_err(FrameError::Decode)?;
+    image.apply_orientation(orientation);
+    let (width, height) = (image.width(), image.height());
+    let pixels = match image {
         DynamicImage::ImageLuma8(gray) => gray.into_raw(),
         other => gray_from_rgb(other.into_rgb8().as_raw()),
     };
     Frame::new(width, height, pixels)
 }
 
-/// Reads width and height of a PNG or JPEG image without decoding its pixels. Errors: `Decode` if the bytes are not PNG
-/// or JPEG.
+/// Reads width and height of a PNG or JPEG image, as [`decode`] returns it, without decoding its pixels. Errors: `Decode` if
+/// the bytes are not PNG or JPEG.
 pub fn dimensions(bytes: &[u8]) -> Result<FrameSize, FrameError> {
     let reader = reader(bytes, MAX_METADATA_BYTES)?;
-    let (width, height) = reader.into_dimensions().map_err(FrameError::Decode)?;
-    Ok(FrameSize { width, height })
+    let mut decoder = reader.into_decoder().map_err(FrameError::Decode)?;
+    let (width, height) = decoder.dimensions();
+    Ok(match orientation(bytes, &mut decoder)? {
+        Orientation::NoTransforms
+        | Orientation::Rotate180
+        | Orientation::FlipHorizontal
+        | Orientation::FlipVertical => FrameSize { width, height },
+        Orientation::Rotate90 | Orientation::Rotate270 | Orientation::Rotate90FlipH | Orientation::Rotate270FlipH => {
+            FrameSize {
+                width: height,
+                height: width,
+            }
+        }
+    })
+}
+
+fn is_jpeg(bytes: &[u8]) -> bool {
+    bytes.starts_with(&[0xff, 0xd8])
+}
+
+/// How the image must be turned to be upright. Cameras write it in JPEG images; PNG images are taken as they are.
+fn orientation(bytes: &[u8], decoder: &mut impl ImageDecoder) -> Result<Orientation, FrameError> {
+    if is_jpeg(bytes) {
+        decoder.orientation().map_err(FrameError::Decode)
+    } else {
+        Ok(Orientation::NoTransforms)
+    }
 }
 
 /// Whether a PNG or JPEG image has color channels, without decoding its pixels. Errors: `Decode` if the bytes are neither.
@@ -92,11 +123,16 @@ pub fn encode_rgb_png(frame: &Frame) -> Result<Vec<u8>, FrameError> {
     Ok(bytes)
 }
 
-/// Encodes the frames as a GIF that repeats forever, with `delay_ms` between two frames. Errors: `Encode`.
-pub fn encode_gif(frames: &[Frame], delay_ms: u32) -> Result<Vec<u8>, FrameError> {
+/// How long a GIF shows each frame, in seconds, whatever their period is: viewers show shorter ones at speeds of their own.
+const GIF_PERIODS_S: [f64; 2] = [0.02, 10.0];
+
+/// Encodes the frames as a GIF that repeats forever, with this time between two frames. Errors: `Encode`.
+pub fn encode_gif(frames: &[Frame], period_s: f64) -> Result<Vec<u8>, FrameError> {
     let mut bytes = Vec::new();
     let mut encoder = GifEncoder::new(&mut bytes);
     encoder.set_repeat(Repeat::Infinite).map_err(FrameError::Encode)?;
+    let [least, most] = GIF_PERIODS_S;
+    let delay_ms = (period_s.clamp(least, most) * 1000.0).round() as u32;
     let delay = image::Delay::from_numer_denom_ms(delay_ms, 1);
     let images = frames.iter().map(|frame| {
         let gray = GrayImage::from_raw(frame.width(), frame.height(), frame.pixels().to_vec());
@@ -133,6 +169,34 @@ mod tests {
     }
 
     #[test]
+    fn a_jpeg_is_turned_as_its_exif_data_says() {
+        // Left half black, right half white.
+        let pixels = [[0; 16], [255; 16]].concat().repeat(16);
+        let of = |orientation: u8| {
+            let mut bytes = Vec::new();
+            let mut encoder = image::codecs::jpeg::JpegEncoder::new(&mut bytes);
+            // One entry: the tag 0x0112, a short.
+            let exif = [
+                b"MM\0\x2a\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0",
+                &[orientation][..],
+                &[0; 6],
+            ]
+            .concat();
+            encoder.set_exif_metadata(exif).unwrap();
+            encoder.write_image(&pixels, 32, 16, ExtendedColorType::L8).unwrap();
+            let frame = decode(&bytes).unwrap();
+            assert_eq!(dimensions(&bytes).unwrap(), frame.size());
+            let (first, last) = (frame.pixels()[0], frame.pixels()[frame.pixels().len() - 1]);
+            let corner = frame.pixels()[frame.width() as usize - 1];
+            (frame.width(), [first, corner, last].map(|level| level > 127))
+        };
+        assert_eq!(of(1), (32, [false, true, true]));
+        assert_eq!(of(3), (32, [true, false, false]));
+        assert_eq!(of(6), (16, [false, false, true]));
+        assert_eq!(of(8), (16, [true, true, false]));
+    }
+
+    #[test]
     fn gray_of_pure_green_is_587_thousandths() {
         assert_eq!(gray_from_rgb(&[0, 255, 0, 255, 255, 255]), [150, 255]);
     }
@@ -140,7 +204,7 @@ mod tests {
     #[test]
     fn a_gif_of_two_frames_is_written() {
         let frame = Frame::new(2, 2, vec![0, 80, 160, 255]).unwrap();
-        let bytes = encode_gif(&[frame.clone(), frame], 200).unwrap();
+        let bytes = encode_gif(&[frame.clone(), frame], 0.2).unwrap();
         assert!(bytes.starts_with(b"GIF89a"));
         assert!(decode(&bytes).is_err(), "only PNG and JPEG are read");
     }

@@ -49,8 +49,8 @@ impl Precision {
         }
     }
 
-    /// The precision of layers for which 8 bits are too few, and of layers with few inputs, where finding the scale of bytes takes as long
-    /// as the products. A processor without bf16 takes single precision there.
+    /// The precision of layers for which 8 bits are too few, and of layers with few inputs and rows, where finding the scale of bytes takes
+    /// as long as the products. A processor without bf16 takes single precision there.
     pub(super) fn at_least_bf16(self) -> Self {
         match self {
             Self::Int8 if Self::Bf16.is_supported() => Self::Bf16,
@@ -59,7 +59,7 @@ impl Precision {
         }
     }
 
-    /// The precision of convolutions and of what describes the rays of a room. They stay in single precision unless one instruction adds up four products of bytes: tiles of
+    /// The precision of convolutions and of layers for each place of a grid, and for each ray of a room. They stay in single precision unless one instruction adds up four products of bytes: tiles of
     /// places save more than AVX2's bytes.
     pub(super) fn of_convolutions(self) -> Self {
         match self {

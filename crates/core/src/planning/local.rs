@@ -10,35 +10,16 @@ use crate::nn::Occupancy;
 use crate::registry::Model;
 use crate::serving::{ConditioningInput, Task, compute_task};
 
-/// The frames that a plan follows.
-pub struct PlanContext {
-    task: Task,
-}
-
-impl PlanContext {
-    /// The context of a task, whose rollouts do not count.
-    #[must_use]
-    pub fn new(task: Task) -> Self {
-        Self { task }
-    }
-
-    /// The task that predicts these plans.
-    #[must_use]
-    pub fn task(&self, conditioning_inputs: Vec<ConditioningInput>, sees_occupancy: bool) -> Task {
-        self.task.with_rollouts(conditioning_inputs, sees_occupancy)
-    }
-}
-
-/// Searches for the best plan from a context, as long as the budget allows. Errors: what does not fit the model, and what the
+/// Searches for the best plan from the context of a task, as long as the budget allows. Errors: what does not fit the model, and what the
 /// computation fails with.
-pub fn plan(model: &Model, context: &PlanContext, input: PlannerInput) -> Result<PlanChoice, PlanError> {
+pub fn plan(model: &Model, context: &Task, input: PlannerInput) -> Result<PlanChoice, PlanError> {
     plan_around(model, context, input, &mut |_| {})
 }
 
 /// As [`plan`], around what `change` makes of what the network sees and expects. Errors: as [`plan`].
 pub fn plan_around(
     model: &Model,
-    context: &PlanContext,
+    context: &Task,
     input: PlannerInput,
     change: &mut dyn FnMut(&mut Occupancy),
 ) -> Result<PlanChoice, PlanError> {
@@ -49,7 +30,7 @@ pub fn plan_around(
     while let Some(batch) = planner.next_batch(&|| begun.elapsed())? {
         let asked = Instant::now();
         let inputs = ConditioningInput::of_plans(batch.plans, state.clone(), steps, &model.manifest)?;
-        let mut prediction = compute_task(model, &context.task(inputs, batch.sees_occupancy))?;
+        let mut prediction = compute_task(model, &context.with_rollouts(inputs, batch.sees_occupancy))?;
         if let Some(occupancy) = &mut prediction.occupancy {
             change(occupancy);
         }
@@ -81,14 +62,14 @@ mod tests {
         vec![limit(0.0, 0.5), limit(-0.8, 0.8)]
     }
 
-    fn context(model: &Model) -> PlanContext {
+    fn context(model: &Model) -> Task {
         let input = PredictionInput {
             frames: (0..3).map(|i| Frame::new(8, 4, vec![i * 40; 32]).unwrap()).collect(),
             state: state(),
             plan: Some(vec![action(0.0, 0.0); 2]),
             ..PredictionInput::default()
         };
-        PlanContext::new(input.into_task(&model.manifest).unwrap())
+        input.into_task(&model.manifest).unwrap()
     }
 
     fn state() -> Option<RobotState> {
@@ -122,9 +103,9 @@ mod tests {
         }
     }
 
-    fn predicted(model: &Model, context: &PlanContext, batch: PlanBatch) -> Prediction {
+    fn predicted(model: &Model, context: &Task, batch: PlanBatch) -> Prediction {
         let inputs = ConditioningInput::of_plans(batch.plans, state(), Some(2), &model.manifest).unwrap();
-        compute_task(model, &context.task(inputs, batch.sees_occupancy)).unwrap()
+        compute_task(model, &context.with_rollouts(inputs, batch.sees_occupancy)).unwrap()
     }
 
     #[test]

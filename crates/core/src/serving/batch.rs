@@ -28,13 +28,17 @@ pub struct BatchChoice {
     pub batch: Vec<usize>,
 }
 
-/// The oldest live task chooses the model. Later tasks of the same model join in order while the rows stay within its
-/// limit, at most one task of a session. The oldest task is always included, even if it alone exceeds the limit.
+/// The first live task chooses the model. Later tasks of the same model join in order while the rows stay within its
+/// limit, at most one task of a session. The first task is always included, even if it alone exceeds the limit. The order is that of their
+/// arrival, or all `steps_first`, the steps of sessions, for whose answers robots wait.
 #[must_use]
-pub fn choose(waiting: &[Candidate], now: Instant) -> BatchChoice {
+pub fn choose(waiting: &[Candidate], now: Instant, steps_first: bool) -> BatchChoice {
     let mut choice = BatchChoice::default();
     let (mut model, mut rows, mut sessions) = (None, 0, Vec::new());
-    for (position, candidate) in waiting.iter().enumerate() {
+    let mut order: Vec<(usize, &Candidate)> = waiting.iter().enumerate().collect();
+    let is_step = |candidate: &Candidate| candidate.session.is_some() && candidate.rows == 1;
+    order.sort_by_key(|(_, candidate)| steps_first && !is_step(candidate));
+    for (position, candidate) in order {
         if candidate.abandoned || candidate.deadline <= now {
             choice.discard.push(position);
             continue;
@@ -47,6 +51,8 @@ pub fn choose(waiting: &[Candidate], now: Instant) -> BatchChoice {
             rows += candidate.rows;
         }
     }
+    choice.batch.sort_unstable();
+    choice.discard.sort_unstable();
     choice
 }
 
@@ -111,7 +117,7 @@ mod tests {
 
     fn chosen(kinds: &[TaskKind], limit: usize) -> BatchChoice {
         let now = Instant::now();
-        choose(&candidates(kinds, now, limit), now)
+        choose(&candidates(kinds, now, limit), now, false)
     }
 
     #[test]
@@ -146,12 +152,31 @@ mod tests {
         assert_eq!(chosen(&[of(0), rows(100), of(0)], 8).batch, [0, 2]);
     }
 
+    #[test]
+    fn steps_of_sessions_pass_older_tasks() {
+        let now = Instant::now();
+        let step = |session| TaskKind {
+            session: Some(session),
+            ..of(1)
+        };
+        let many = TaskKind {
+            rows: 4,
+            session: Some(3),
+            ..of(0)
+        };
+        let waiting = candidates(&[many, of(1), step(1), step(2)], now, 3);
+        assert_eq!(choose(&waiting, now, true).batch, [1, 2, 3]);
+        assert_eq!(choose(&waiting, now, false).batch, [0]);
+        let waiting = candidates(&[of(1), of(1), step(1), step(2)], now, 2);
+        assert_eq!(choose(&waiting, now, true).batch, [2, 3]);
+    }
+
     proptest! {
         #[test]
         fn a_batch_holds_the_oldest_task_and_others_of_its_model(kinds in kinds(), limit in 1usize..10) {
             let now = Instant::now();
             let waiting = candidates(&kinds, now, limit);
-            let choice = choose(&waiting, now);
+            let choice = choose(&waiting, now, false);
             let rows: usize = choice.batch.iter().map(|&i| waiting[i].rows).sum();
             prop_assert!(rows <= limit || choice.batch.len() == 1);
             prop_assert!(choice.batch.is_sorted());
@@ -166,7 +191,7 @@ mod tests {
         fn a_batch_holds_only_the_oldest_step_of_a_session(kinds in kinds(), limit in 1usize..10) {
             let now = Instant::now();
             let waiting = candidates(&kinds, now, limit);
-            for &position in &choose(&waiting, now).batch {
+            for &position in &choose(&waiting, now, false).batch {
                 let earlier = waiting[..position].iter().filter(|c| !c.abandoned && c.deadline > now);
                 let session = waiting[position].session;
                 prop_assert!(session.is_none() || earlier.clone().all(|c| c.session != session));

@@ -52,6 +52,8 @@ pub(super) enum WorkItem {
 struct QueueState {
     waiting: VecDeque<QueuedTask>,
     loads: VecDeque<ModelLoad>,
+    /// Whether the last batch passed an older task. Then the oldest is next, so that steps of sessions never keep others waiting for long.
+    has_passed: bool,
     closed: bool,
 }
 
@@ -167,7 +169,9 @@ impl QueueState {
                 deadline: waiting.deadline,
             })
             .collect();
-        let choice = batch::choose(&candidates, now);
+        let choice = batch::choose(&candidates, now, !self.has_passed);
+        let oldest_left = (0..candidates.len()).find(|place| choice.discard.binary_search(place).is_err());
+        self.has_passed = oldest_left.is_some_and(|oldest| choice.batch.binary_search(&oldest).is_err());
         let mut batch = Vec::with_capacity(choice.batch.len());
         let mut remaining = VecDeque::with_capacity(self.waiting.len());
         for (position, waiting) in self.waiting.drain(..).enumerate() {

@@ -239,7 +239,9 @@ impl SessionState {
         let spare = (self.features.len() + 1).saturating_sub(spec.context);
         let past_features: Vec<Features> = self.features.iter().skip(spare).cloned().collect();
         let is_full = past_features.len() + 1 == spec.context;
-        let past_states = self.past_states.iter().chain(&self.conditioning.state);
+        // Without the last frame's, those before it would count as those of later frames.
+        let last_state = self.conditioning.state.iter();
+        let past_states = last_state.flat_map(|last| self.past_states.iter().chain([last]));
         Task {
             past_features,
             past_states: last_states(past_states.cloned().collect(), spec),

@@ -11,10 +11,13 @@ use super::{Dataset, DatasetError, Episode};
 use foreframe_core::types::Seed;
 use foreframe_sim::TrialParameters;
 
-/// A time step longer than this many median periods is a gap. No window crosses a gap.
-const GAP_PERIODS: f64 = 3.0;
+/// A time step longer than this many median periods is a gap. No window crosses a gap. A step of three periods never is one, whatever
+/// the last bits of the times are.
+pub(crate) const GAP_PERIODS: f64 = 3.5;
 /// Recordings are split by complete episodes if there are at least this many, otherwise by time.
 const WHOLE_EPISODES: usize = 10;
+/// Frames of the windows of all presets: 5 to see and 5 to predict.
+pub(crate) const WINDOW_FRAMES: usize = 10;
 /// Trials are split in blocks of ten: eight for training, one for validation, one for testing.
 const BLOCK: u64 = 10;
 
@@ -118,7 +121,7 @@ impl EpisodeSegment {
 
 /// The episodes and segments of each split. Simulated trials are never divided; their split depends only on split seed and
 /// trial number, so that trials keep their split when a collection grows. Recordings are split by time, in complete episodes
-/// if there are ten or more.
+/// if there are ten or more that allow it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Splits {
     episodes: [Vec<usize>; Split::ALL.len()],
@@ -261,9 +264,31 @@ fn split_part(episodes: &[Episode], split_seed: Seed) -> Vec<(Split, EpisodeSegm
             });
             splits.zip(whole).collect()
         }
-        None if episodes.len() >= WHOLE_EPISODES => whole_episodes(episodes),
+        None if episodes.len() >= WHOLE_EPISODES => {
+            let mut splits = [1, WINDOW_FRAMES]
+                .map(|least| whole_episodes(episodes, least))
+                .into_iter();
+            splits
+                .find(|split| is_usable(split))
+                .unwrap_or_else(|| by_time(episodes))
+        }
         None => by_time(episodes),
     }
+}
+
+/// Whether half of the frames are for training, and each part can have windows if any episode can.
+fn is_usable(parts: &[(Split, EpisodeSegment)]) -> bool {
+    let of = |split| {
+        parts
+            .iter()
+            .filter(move |part| part.0 == split)
+            .map(|part| part.1.frames.len())
+    };
+    let longest = |split| of(split).max().unwrap_or_default();
+    let splits = [Split::Train, Split::Validation, Split::Test];
+    let has_windows = splits.map(|split| longest(split) >= WINDOW_FRAMES);
+    let all: usize = splits.into_iter().flat_map(of).sum();
+    2 * of(Split::Train).sum::<usize>() >= all && (has_windows == [true; 3] || has_windows == [false; 3])
 }
 
 /// The frames of these episodes, which follow one another.
@@ -273,16 +298,21 @@ fn frames_of(episodes: &[Episode]) -> Range<usize> {
 }
 
 /// Splits complete episodes by time. The last ones, with at least a tenth of all frames, are for testing; the ones before
-/// them, with at least a tenth, for validation; the others for training.
-fn whole_episodes(episodes: &[Episode]) -> Vec<(Split, EpisodeSegment)> {
+/// them, with at least a tenth, for validation; the others for training. Episodes of less than `least` frames do not count.
+fn whole_episodes(episodes: &[Episode], least: usize) -> Vec<(Split, EpisodeSegment)> {
     let tenth = frames_of(episodes).len().div_ceil(10);
     let (mut test, mut validation) = (0, 0);
     let backwards = episodes.iter().rev().map(|episode| {
+        let counted = if episode.frame_count < least {
+            0
+        } else {
+            episode.frame_count
+        };
         let split = if test < tenth {
-            test += episode.frame_count;
+            test += counted;
             Split::Test
         } else if validation < tenth {
-            validation += episode.frame_count;
+            validation += counted;
             Split::Validation
         } else {
             Split::Train

@@ -10,8 +10,11 @@ use foreframe_core::types::Channel;
 const BINS: usize = 40;
 /// Warn if one value fills more than this share of the frames.
 const MOST_FRAMES: f64 = 0.95;
-/// Warn if a value is further from the mean than this many standard deviations.
-const FAR_DEVIATIONS: f64 = 20.0;
+/// The share of the frames with the least values, and of those with the greatest, that can be outliers. Since `MOST_FRAMES` are not
+/// equal, the others have a range.
+const OUTER_FRAMES: f64 = 0.02;
+/// Warn if a value is further from those of the other frames than this many times their range.
+const FAR_RANGES: f64 = 5.0;
 
 /// Whether a channel belongs to the action or the state.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
@@ -50,6 +53,10 @@ pub struct ChannelSummary {
     pub commonest: f64,
     /// Share of the frames with that value, 0 to 1.
     pub commonest_share: f64,
+    /// Least value of the frames without the least and the greatest 2 %.
+    pub inner_min: f64,
+    /// Greatest value of these frames.
+    pub inner_max: f64,
     /// All values.
     pub histogram: Histogram,
 }
@@ -78,6 +85,10 @@ fn summary(role: ChannelRole, channel: &Channel, mut values: Vec<f64>) -> Channe
     let variance = values.iter().map(|value| (value - mean).powi(2)).sum::<f64>() / count;
     let histogram = Histogram::of(values.iter().copied(), BINS);
     let (commonest, frames) = commonest(&mut values);
+    let outer = (values.len() as f64 * OUTER_FRAMES).ceil() as usize;
+    let inner = values
+        .get(outer..values.len().saturating_sub(outer))
+        .unwrap_or_default();
     ChannelSummary {
         role,
         name: channel.name.clone(),
@@ -88,11 +99,13 @@ fn summary(role: ChannelRole, channel: &Channel, mut values: Vec<f64>) -> Channe
         std: variance.sqrt(),
         commonest,
         commonest_share: frames as f64 / count,
+        inner_min: inner.first().copied().unwrap_or(histogram.from),
+        inner_max: inner.last().copied().unwrap_or(histogram.to),
         histogram,
     }
 }
 
-/// The value that occurs most often, and how often.
+/// The value that occurs most often, and how often. Sorts the values.
 fn commonest(values: &mut [f64]) -> (f64, usize) {
     values.sort_unstable_by(f64::total_cmp);
     let runs = values.chunk_by(|a, b| a == b);
@@ -138,16 +151,51 @@ impl ChannelSummary {
                 100.0 * self.commonest_share
             ));
         }
-        let farthest = (self.max - self.mean).max(self.mean - self.min);
-        (farthest > FAR_DEVIATIONS * self.std).then(|| {
+        let farthest = (self.max - self.inner_max).max(self.inner_min - self.min);
+        let range = self.inner_max - self.inner_min;
+        (range > 0.0 && farthest > FAR_RANGES * range).then(|| {
             format!(
-                "The {role} \"{name}\" has values from {} to {}, which is up to {:.0} standard deviations from its mean {}. \
-                 Such a value is often an error of the sensor; leave out those records before the import.",
+                "The {role} \"{name}\" has values from {} to {}, but most are from {} to {}. Such a value is often an error of \
+                 the sensor; leave out those records before the import.",
                 number(self.min),
                 number(self.max),
-                farthest / self.std,
-                number(self.mean)
+                number(self.inner_min),
+                number(self.inner_max)
             )
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn warned(values: impl IntoIterator<Item = f64>) -> Option<String> {
+        summary(
+            ChannelRole::Action,
+            &Channel::new("turn", ""),
+            values.into_iter().collect(),
+        )
+        .warning()
+    }
+
+    #[test]
+    fn a_single_outlier_of_a_short_recording_is_found() {
+        for frames in [30, 300, 3000] {
+            let wave = move |frame: i32| (f64::from(frame) * 0.3).sin();
+            assert_eq!(warned((0..frames).map(wave)), None);
+            let with_outlier = (0..frames).map(|frame| if frame == 20 { -1000.0 } else { wave(frame) });
+            let warning = warned(with_outlier).unwrap();
+            assert!(warning.contains(" from -1000 to "), "{warning}");
+        }
+    }
+
+    #[test]
+    fn rare_commands_are_no_outliers() {
+        let pulses = |one_of: i32, frames: i32| (0..frames).map(move |frame| f64::from(u8::from(frame % one_of == 0)));
+        assert_eq!(warned(pulses(10, 400)), None);
+        assert_eq!(warned(pulses(15, 3000)), None);
+        assert_eq!(warned([0.3; 400]), None);
+        assert_eq!(warned([0.0, 0.0, 7.0]), None);
     }
 }

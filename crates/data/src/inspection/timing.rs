@@ -5,18 +5,14 @@ use serde::Serialize;
 use super::histogram::Histogram;
 use super::places::{FramePlace, counted, listed, places};
 use crate::dataset::Dataset;
-use crate::dataset::sampler::median;
+use crate::dataset::sampler::{GAP_PERIODS, WINDOW_FRAMES, median};
 
-/// A step longer than this many median steps is a gap.
-const GAP_STEPS: f64 = 3.0;
 /// A step that differs by more than this share of the median step is irregular.
 const IRREGULAR_SHARE: f64 = 0.25;
 /// Warn if more than this share of the steps is irregular.
 const MANY_IRREGULAR: f64 = 0.05;
 /// Warn if the median step differs by more than this share of the frame period.
 const PERIOD_TOLERANCE: f64 = 0.05;
-/// Frames of the windows of all presets: 5 to see and 5 to predict.
-const WINDOW_FRAMES: usize = 10;
 const STEP_BINS: usize = 40;
 
 /// Lengths of episodes and times of frames.
@@ -44,7 +40,7 @@ pub struct FrameTiming {
     pub irregular_steps: usize,
     /// Number of all steps.
     pub steps: usize,
-    /// Steps longer than three median steps.
+    /// Steps longer than 3.5 median steps.
     pub gaps: Vec<TimeGap>,
     /// All steps in milliseconds.
     pub step_ms_histogram: Histogram,
@@ -67,7 +63,7 @@ pub(super) fn of(dataset: &Dataset) -> FrameTiming {
     let mut seconds: Vec<f64> = steps.iter().map(|step| step.seconds).collect();
     let total_s = seconds.iter().sum();
     let median_step_s = median(&mut seconds).unwrap_or_default();
-    let is_gap = |step: &&TimeGap| step.seconds > GAP_STEPS * median_step_s;
+    let is_gap = |step: &&TimeGap| step.seconds > GAP_PERIODS * median_step_s;
     let is_irregular = |step_s: &&f64| (*step_s - median_step_s).abs() > IRREGULAR_SHARE * median_step_s;
     FrameTiming {
         frame_period_s: dataset.info().frame_period_s,

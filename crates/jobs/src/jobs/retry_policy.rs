@@ -14,8 +14,8 @@ use foreframe_core::error_text;
 
 /// How long a job waits for a store before it fails. It can be resumed.
 const LIMIT: Duration = Duration::from_hours(1);
-/// The pause between two tries.
-const PAUSE: Duration = Duration::from_secs(1);
+/// The pause between two tries: twice as long after each, up to the second.
+const PAUSES: [Duration; 2] = [Duration::from_secs(1), Duration::from_secs(30)];
 /// How often the job is asked during a pause whether it was cancelled.
 const POLL: Duration = Duration::from_millis(50);
 
@@ -48,28 +48,35 @@ impl RetryPolicy<'_> {
 
     /// The same for work that blocks.
     pub(super) fn repeat<T, E: HasErrorKind>(&self, mut work: impl FnMut() -> Result<T, E>) -> Result<T, JobFailure> {
-        let (began, mut is_told) = (Instant::now(), false);
+        let [mut pause, longest] = PAUSES;
+        // Since when the store is away.
+        let mut away_since: Option<Instant> = None;
         loop {
+            let began = Instant::now();
             let error = match work() {
                 Ok(done) => return Ok(done),
                 Err(error) => error,
             };
             let reason = error_text::with_causes(&error);
-            if error.kind() != ErrorKind::Away || began.elapsed() >= LIMIT {
+            // What could work for so long has found the store in between.
+            let is_known = away_since.is_some() && began.elapsed() < LIMIT;
+            let since = *away_since.get_or_insert_with(Instant::now);
+            if error.kind() != ErrorKind::Away || (is_known && since.elapsed() >= LIMIT) {
                 return Err(JobFailure::Failed(reason));
             }
-            if !is_told {
+            if !is_known {
                 warn!(reason, "a job waits for the store");
                 self.report.line(format!("waiting for the store: {reason}"));
-                is_told = true;
+                (away_since, pause) = (Some(Instant::now()), PAUSES[0]);
             }
             let paused = Instant::now();
-            while paused.elapsed() < PAUSE {
+            while paused.elapsed() < pause {
                 if self.cancelled.load(Ordering::Acquire) {
                     return Err(JobFailure::Cancelled);
                 }
                 std::thread::sleep(POLL);
             }
+            pause = longest.min(2 * pause);
         }
     }
 }

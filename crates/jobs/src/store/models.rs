@@ -9,17 +9,6 @@ use super::lease::Lease;
 use super::{Store, StoreError};
 use foreframe_core::types::ModelName;
 
-/// A published version.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
-pub struct VersionRow {
-    /// The model's name.
-    pub model: ModelName,
-    /// The version's number.
-    pub version: u32,
-    /// When it was published, in seconds since 1970.
-    pub published_s: f64,
-}
-
 /// A version that a job published.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct PublishedVersion {
@@ -100,10 +89,11 @@ impl Store {
     }
 
     /// All published versions that are not deleted, by name and number. Errors: `Query`.
-    pub async fn published_versions(&self) -> Result<Vec<VersionRow>, StoreError> {
-        let sql = "SELECT model, version, published_s FROM model_versions \
+    pub async fn published_versions(&self) -> Result<Vec<(ModelName, u32)>, StoreError> {
+        let sql = "SELECT model, version FROM model_versions \
              WHERE published_s IS NOT NULL AND deleted_s IS NULL ORDER BY model, version";
-        read_all(self.database.fetch(sql, values![]).await?)
+        let rows = self.database.fetch(sql, values![]).await?;
+        rows.iter().map(version_of).collect()
     }
 
     /// All versions that were deleted, by name and number. Errors: `Query`.

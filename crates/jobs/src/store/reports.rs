@@ -65,10 +65,13 @@ impl Store {
 
 /// Writes the report in the transaction that has checked the lease.
 pub(super) async fn write_report(tx: &mut Tx, id: JobId, report: JobReport) -> Result<(), StoreError> {
+    let has_lines = !report.lines.is_empty();
     for (time_s, line) in report.lines {
         let sql = "INSERT INTO job_logs (job, seq, time_s, line) \
              SELECT $1, COALESCE(MAX(seq), 0) + 1, $2, $3 FROM job_logs WHERE job = $1";
         tx.execute(sql, values![id, time_s, line]).await?;
+    }
+    if has_lines {
         let sql = "DELETE FROM job_logs WHERE job = $1 AND \
              seq <= (SELECT MAX(seq) FROM job_logs WHERE job = $1) - $2";
         tx.execute(sql, values![id, report.max_lines]).await?;

@@ -1,11 +1,14 @@
 //! Whether a model can run on a data set, checked before anything is computed.
 
 use super::EvaluationError;
+use super::config::ScoredSplit;
+use super::windows::window_shape;
+use crate::frame_marks::{self, FramesOfTraining};
 use foreframe_core::error_text::comma_separated;
 use foreframe_core::nn::ModelSpec;
 use foreframe_core::registry::{Manifest, Model};
 use foreframe_core::types::Seed;
-use foreframe_data::dataset::{Dataset, DatasetInfo};
+use foreframe_data::dataset::{Dataset, DatasetInfo, Window};
 
 /// Frame periods count as equal if they differ by less than this share.
 const PERIOD_TOLERANCE: f64 = 0.01;
@@ -88,15 +91,67 @@ pub(super) fn has_actions_of(spec: &ModelSpec, dataset: &Dataset) -> bool {
     spec.action_inputs().is_some() && comma_separated(&spec.actions) == comma_separated(&dataset.info().action_channels)
 }
 
-/// Errors: `TrainedOn` if the model was trained on this data set, so that it cannot be tested on all of it.
-pub(super) fn check_untrained(loaded: &Model, dataset: &Dataset) -> Result<(), EvaluationError> {
-    if loaded.manifest.dataset.includes(&dataset.info().content_hash) {
+/// Errors: `TrainedOn` and `TrainedOnFrames` if the model was trained on this data set, or on frames of these windows of it, so that it
+/// cannot be tested on all of it; those of [`Dataset::pixels`].
+pub(super) fn check_untrained(loaded: &Model, dataset: &Dataset, windows: &[Window]) -> Result<(), EvaluationError> {
+    let (model, info) = (&loaded.manifest, dataset.info());
+    let (name, title) = (model.name.clone(), info.name.clone());
+    if model.dataset.includes(&info.content_hash) {
         return Err(EvaluationError::TrainedOn {
-            model: loaded.manifest.name.clone(),
-            dataset: dataset.info().name.clone(),
+            model: name,
+            dataset: title,
         });
     }
-    Ok(())
+    match frames_of_training(loaded, dataset, windows)? {
+        Some(frames) if frames.were_trained_on() => Err(EvaluationError::TrainedOnFrames {
+            model: name,
+            dataset: title,
+            frames,
+        }),
+        _ => Ok(()),
+    }
+}
+
+/// How many frames of these windows the training had. Not asked of a data set that the model was trained on, which is split. Not known
+/// of a model of an earlier program. Errors: those of [`Dataset::pixels`].
+pub(super) fn frames_of_training(
+    loaded: &Model,
+    dataset: &Dataset,
+    windows: &[Window],
+) -> Result<Option<FramesOfTraining>, EvaluationError> {
+    let trained = &loaded.manifest.dataset;
+    if trained.frame_marks.is_empty() || trained.includes(&dataset.info().content_hash) {
+        return Ok(None);
+    }
+    // The training had the frames as they are stored.
+    let as_stored = (dataset.brightness() != 1.0).then(|| dataset.clone().with_brightness(1.0));
+    let length = window_shape(loaded.spec()).frames();
+    let marks = frame_marks::of_windows(as_stored.as_ref().unwrap_or(dataset), windows, length)?;
+    Ok(Some(FramesOfTraining::count(&marks, &trained.frame_marks)))
+}
+
+/// Whether the scores may be written into the model's manifest: those on its own data set, and those that replace none of another data
+/// set. Errors: `OtherScores`.
+#[doc(hidden)]
+pub fn check_saving(loaded: &Model, dataset: &Dataset, split: ScoredSplit) -> Result<(), EvaluationError> {
+    let (model, info) = (&loaded.manifest, dataset.info());
+    if model.dataset.includes(&info.content_hash) {
+        return Ok(());
+    }
+    let split = split.of(loaded, dataset);
+    let names = split.splits().iter().map(|&part| split.set_name(dataset, part));
+    let is_of_another = |name: &&str| {
+        let saved = model.metrics.get(*name);
+        saved.is_some_and(|scores| scores["dataset_content_hash"] != info.content_hash.as_str())
+    };
+    match { names }.find(is_of_another) {
+        Some(set) => Err(EvaluationError::OtherScores {
+            model: model.name.clone(),
+            set,
+            dataset: info.name.clone(),
+        }),
+        None => Ok(()),
+    }
 }
 
 /// The seed of the split to test with: that of the model's training, unless another is asked for.

@@ -13,6 +13,9 @@ use foreframe_data::dataset::Dataset;
 use foreframe_data::dataset::sampler::{Split, Splits};
 use foreframe_sim::RoomSet;
 
+/// The name of the set that is a whole data set.
+const WHOLE_SET: &str = "whole-set";
+
 /// What a model is scored on.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
@@ -35,6 +38,14 @@ impl ScoredSplit {
             Self::Validation => &[Split::Validation],
             Self::Test => &[Split::Test, Split::UnseenPairs, Split::UnseenGains],
             Self::WholeSet => &[Split::Test],
+        }
+    }
+
+    /// The name of the set that one of the splits is: of a whole data set, that of its rooms if they are only for tests.
+    pub(super) fn set_name(self, dataset: &Dataset, split: Split) -> &'static str {
+        match self {
+            Self::WholeSet => test_rooms(dataset).map_or(WHOLE_SET, RoomSet::name),
+            Self::Validation | Self::Test => split.name(),
         }
     }
 

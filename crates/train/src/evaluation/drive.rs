@@ -110,9 +110,9 @@ mod tests {
         let results = &scores[0].episodes;
         assert!(results.iter().any(|result| result.arrived), "{results:?}");
         for result in results {
-            assert!(result.shortest_m >= 1.5 && result.way_m > 0.0);
+            assert!(result.shortest_m >= 1.25 && result.way_m > 0.0);
             // The robot arrives beside the goal, not on it.
-            assert!(!result.arrived || result.way_m > result.shortest_m - 0.3, "{result:?}");
+            assert!(!result.arrived || result.way_m > result.shortest_m - 0.05, "{result:?}");
         }
         assert_eq!(run()[0].episodes, scores[0].episodes);
     }

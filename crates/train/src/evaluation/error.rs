@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use crate::frame_marks::FramesOfTraining;
 use foreframe_core::error_kind::{ErrorKind, HasErrorKind};
 use foreframe_core::files::is_transient;
 use foreframe_core::frame::FrameError;
@@ -22,6 +23,36 @@ pub enum EvaluationError {
     TrainedOn {
         /// The model's name.
         model: ModelName,
+        /// The data set's name.
+        dataset: String,
+    },
+    /// Frames of the data set that is to be scored as a whole were in the model's training.
+    #[error(
+        "{} of {} sampled frames of data set \"{dataset}\" were in the training of model \"{model}\", so not all of it can test the \
+         model; score data that the training never had",
+        frames.seen,
+        frames.sampled
+    )]
+    #[doc(hidden)]
+    TrainedOnFrames {
+        /// The model's name.
+        model: ModelName,
+        /// The data set's name.
+        dataset: String,
+        /// How many.
+        frames: FramesOfTraining,
+    },
+    /// The model has scores of another data set, which would be replaced.
+    #[error(
+        "model \"{model}\" has scores \"{set}\" of another data set; those on data set \"{dataset}\" would replace them; leave out \
+         --save-scores"
+    )]
+    #[doc(hidden)]
+    OtherScores {
+        /// The model's name.
+        model: ModelName,
+        /// The name of the set.
+        set: &'static str,
         /// The data set's name.
         dataset: String,
     },
@@ -170,11 +201,15 @@ impl HasErrorKind for EvaluationError {
             | Self::NothingHeldOut { .. }
             | Self::NotCalibrated { .. }
             | Self::Seen { .. }
+            | Self::OtherScores { .. }
             | Self::NoContext { .. } => ErrorKind::Usage,
             Self::OutputExists(_) => ErrorKind::Conflict,
-            Self::TrainedOn { .. } | Self::NotFinite { .. } | Self::Frame(_) | Self::Replay(_) | Self::Action(_) => {
-                ErrorKind::Unusable
-            }
+            Self::TrainedOn { .. }
+            | Self::TrainedOnFrames { .. }
+            | Self::NotFinite { .. }
+            | Self::Frame(_)
+            | Self::Replay(_)
+            | Self::Action(_) => ErrorKind::Unusable,
             Self::Cancelled => ErrorKind::Cancelled,
             Self::Io { .. } | Self::Chart { .. } | Self::Network(_) => ErrorKind::Internal,
         }

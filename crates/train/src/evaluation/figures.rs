@@ -161,13 +161,12 @@ fn animate(
         Ok(montage(&title, &[row], &style)?)
     });
     let moments: Vec<Frame> = moments.collect::<Result<_, EvaluationError>>()?;
-    let delay_ms = (spec.frame_period_s * 1000.0).round().max(20.0) as u32;
     let caption = format!(
         "The trial of the median window, {} frames ({:.1} s) ahead: truth, prediction, {}",
         spec.horizon,
         spec.horizon as f64 * spec.frame_period_s,
         Method::CopyLast.label()
     );
-    let gif = codec::encode_gif(&moments, delay_ms)?;
+    let gif = codec::encode_gif(&moments, spec.frame_period_s)?;
     Ok(Some(Figure::new("prediction.gif".to_owned(), caption, gif)))
 }

@@ -8,7 +8,7 @@ use super::bootstrap::{CONFIDENCE, FEWEST_GROUPS};
 use super::method::Method;
 use super::metrics::PSNR_CAP_DB;
 use super::pixel_class::PixelClass;
-use super::report::{EvaluationReport, SetReport, SetScores};
+use super::report::{EvaluationReport, SetReport};
 
 /// Squared errors are shown in this unit.
 const MSE_UNIT: f64 = 1e-4;
@@ -27,7 +27,7 @@ impl EvaluationReport {
         environment.add_filter("method", |method: ViaDeserialize<Method>| method.label());
         environment.add_filter("pixel_class", |class: ViaDeserialize<PixelClass>| class.label());
         environment.add_filter("variant", |variant: ViaDeserialize<Variant>| variant.label());
-        let verdicts = self.sets.iter().map(|set| set.outcome.scores().map(SetScores::verdict));
+        let verdicts = self.sets.iter().map(|set| self.verdict(set));
         let second = |set: &SetReport| set.outcome.scores()?.verdict_against_unfitted();
         let report = Value::from_serialize(self);
         let context = context! {
@@ -35,12 +35,19 @@ impl EvaluationReport {
             confidence => CONFIDENCE,
             fewest_groups => FEWEST_GROUPS,
             verdicts => verdicts.collect::<Vec<_>>(),
+            has_frames_of_training => self.has_frames_of_training(),
+            has_codec => self.has_row(Method::CodecOnly),
             verdicts_against_unfitted => self.sets.iter().map(second).collect::<Vec<_>>(),
             ..report
         };
         environment
             .render_str(include_str!("report.md.jinja"), context)
             .expect("a report that does not fit its template is a bug")
+    }
+
+    fn has_row(&self, method: Method) -> bool {
+        let mut scored = self.sets.iter().filter_map(|set| set.outcome.scores());
+        scored.any(|scores| scores.methods.iter().any(|row| row.method == method))
     }
 }
 
@@ -50,6 +57,7 @@ pub(super) fn set_title(split: &str, is_recording: bool) -> &'static str {
         "validation" => "Validation",
         "unseen-pairs" => "Unseen start/goal pairs",
         "unseen-gains" => "Unseen gains",
+        "whole-set" => "Whole data set",
         "new-materials" => "New materials",
         "new-cameras" => "New cameras",
         _ if is_recording => "Test part",
@@ -77,7 +85,7 @@ fn number(value: f64, format: &str) -> String {
 }
 
 /// 1234567 as 1 234 567.
-fn grouped(number: u64) -> String {
+pub(super) fn grouped(number: u64) -> String {
     match number {
         0..1000 => number.to_string(),
         _ => format!("{} {:03}", grouped(number / 1000), number % 1000),

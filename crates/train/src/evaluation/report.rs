@@ -17,6 +17,8 @@ use super::ranking::PlanRanking;
 use super::skill::{Skill, skill};
 use super::surroundings::SurroundingsScores;
 use super::uncertainty::{NoveltyScores, UncertaintyScores};
+#[doc(hidden)]
+pub use crate::frame_marks::FramesOfTraining;
 use foreframe_core::nn::precision::{self, Precision};
 use foreframe_core::registry::{DatasetStamp, Model, ProgramStamp};
 use foreframe_core::types::{ModelName, Seed};
@@ -47,6 +49,14 @@ impl EvaluationReport {
     #[must_use]
     pub fn scores(&self, split: &str) -> Option<&SetScores> {
         self.sets.iter().find(|set| set.split == split)?.outcome.scores()
+    }
+
+    /// Whether frames of a set that was scored were in the model's training.
+    #[doc(hidden)]
+    #[must_use]
+    pub fn has_frames_of_training(&self) -> bool {
+        let mut scored = self.sets.iter().filter_map(|set| set.outcome.scores());
+        scored.any(SetScores::has_frames_of_training)
     }
 
     /// The scores in a few numbers for each set, for the model's manifest.
@@ -85,6 +95,9 @@ impl EvaluationReport {
                 summary["strongest_unfitted_baseline"] = json!(skill.best_mean_baseline);
                 summary["skill_against_unfitted_interval_95"] =
                     json!(interval.map(|interval| [interval.low, interval.high]));
+            }
+            if let Some(frames) = scores.frames_of_training {
+                summary["frames_of_training"] = json!(frames);
             }
             if let Some(benchmark) = &model.benchmark {
                 summary["squared_error_per_frame"] = json!(benchmark.squared_error.mean);
@@ -215,7 +228,10 @@ impl ModelSummary {
             inverted: spec.preprocess.invert,
             parameters: spec.parameter_count(),
             multiply_adds_per_frame: spec.multiply_adds_per_frame(),
-            trained_on: loaded.manifest.dataset.clone(),
+            trained_on: DatasetStamp {
+                frame_marks: Vec::new(),
+                ..loaded.manifest.dataset.clone()
+            },
         }
     }
 }
@@ -239,8 +255,8 @@ pub struct NearestSummary {
 /// One test set.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct SetReport {
-    /// `test`, `unseen-pairs`, `unseen-gains` or `validation`; `new-materials` or `new-cameras` for rooms that are only for
-    /// tests.
+    /// `test`, `unseen-pairs`, `unseen-gains`, `validation` or `whole-set`; `new-materials` or `new-cameras` for rooms that are
+    /// only for tests.
     pub split: String,
     /// Its scores, or why there are none.
     #[serde(flatten)]
@@ -289,10 +305,15 @@ pub struct SetScores {
     /// The headline.
     pub skill: Skill,
     /// The skill against only those baselines that know nothing of this data set, because they learned nothing from its
-    /// training part. Absent for a model that was trained on the data set.
+    /// training part. Absent for a model that was trained on the data set or on frames of the windows.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[doc(hidden)]
     pub skill_against_unfitted: Option<Skill>,
+    /// How many frames of the windows were in the model's training. Absent for a model that was trained on the data set, or by an earlier
+    /// program.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[doc(hidden)]
+    pub frames_of_training: Option<FramesOfTraining>,
     /// Model, baselines and codec.
     pub methods: Vec<MethodScores>,
     /// Mean squared error of the model in its own space (smoothed, and inverted if the model inverts); not comparable
@@ -326,6 +347,11 @@ pub struct SetScores {
 }
 
 impl SetScores {
+    /// Whether frames of the windows were in the model's training, so that they do not test it.
+    pub(super) fn has_frames_of_training(&self) -> bool {
+        self.frames_of_training.is_some_and(FramesOfTraining::were_trained_on)
+    }
+
     /// The scores of these windows, whose rows are the methods. What else a set may have is filled in later.
     pub(super) fn new(methods: &[Method], windows: &[WindowScores], bootstrap: &Bootstrap, is_recording: bool) -> Self {
         let trial_of: Vec<usize> = windows.iter().map(|window| window.group).collect();
@@ -340,6 +366,7 @@ impl SetScores {
             intervals_are_reliable: groups >= FEWEST_GROUPS,
             skill: skill(methods, windows, bootstrap),
             skill_against_unfitted: None,
+            frames_of_training: None,
             methods: summarize(methods, windows),
             model_space_mse: StepCurve::new(own_space.means()),
             reconstruction_mse: StepCurve::new(by_trial(|window| &window.reconstruction_mse).means()),

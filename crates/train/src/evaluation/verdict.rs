@@ -1,15 +1,44 @@
 //! What the scores of a set say, in a sentence.
 
-use super::report::SetScores;
+use super::markdown::grouped;
+use super::report::{EvaluationReport, SetReport, SetScores};
 
 /// What a reader may do about a model that is not better than simple baselines.
 const ADVICE: &str = "more data or a longer training may help";
 
-impl SetScores {
-    /// Whether the model is better than the strongest baseline, by how much, and what to do if it is not.
+/// A baseline that knows less than one window for so many of the model's is not as strong as it could be.
+const WINDOWS_FOR_ONE: usize = 10;
+
+impl EvaluationReport {
+    /// What the scores of a set say: whether the model is better than the strongest baseline, by how much, what to do if it is not, and
+    /// what makes the skill too high. `None` if the set was skipped.
     #[doc(hidden)]
     #[must_use]
-    pub fn verdict(&self) -> String {
+    pub fn verdict(&self, set: &SetReport) -> Option<String> {
+        let scores = set.outcome.scores()?;
+        let sentences = [Some(scores.verdict()), scores.seen_frames(), self.weak_baseline()];
+        Some(sentences.into_iter().flatten().collect::<Vec<_>>().join("; "))
+    }
+
+    /// That the nearest training windows, often the strongest baseline, know much less than the model.
+    fn weak_baseline(&self) -> Option<String> {
+        let known = self.model.trained_on.windows;
+        match &self.nearest_windows {
+            None => {
+                Some("there is no baseline of nearest training windows here, so the skill may be too high".to_owned())
+            }
+            Some(nearest) if nearest.searched.saturating_mul(WINDOWS_FOR_ONE) < known => Some(format!(
+                "the baseline of nearest training windows knows {} of them, the model {}, so the skill may be too high",
+                grouped(nearest.searched as u64),
+                grouped(known as u64)
+            )),
+            Some(_) => None,
+        }
+    }
+}
+
+impl SetScores {
+    fn verdict(&self) -> String {
         let (mean, interval) = (self.skill.skill.mean, self.skill.mean_interval);
         let baseline = format!("the strongest baseline ({})", self.skill.best_mean_baseline.label());
         let percent = 100.0 * mean.abs();
@@ -26,6 +55,15 @@ impl SetScores {
             _ => format!("worse than {baseline} by {percent:.0} %; {ADVICE}"),
         };
         self.with_doubt(verdict)
+    }
+
+    /// That frames of the windows were in the training, if they were.
+    fn seen_frames(&self) -> Option<String> {
+        let frames = self.frames_of_training.filter(|frames| frames.were_trained_on())?;
+        Some(format!(
+            "{} of {} sampled frames were in the model's training, so this does not test what it never saw",
+            frames.seen, frames.sampled
+        ))
     }
 
     /// The same, with what makes it doubtful if there is something.
@@ -67,6 +105,7 @@ impl SetScores {
 mod tests {
     use super::*;
     use crate::evaluation::bootstrap::{Bootstrap, Interval};
+    use crate::evaluation::report::FramesOfTraining;
     use foreframe_core::types::Seed;
 
     fn verdict(mean: f64, interval: Option<(f64, f64)>, is_reliable: bool) -> String {
@@ -79,6 +118,22 @@ mod tests {
         scores.skill.mean_interval = interval.map(|(low, high)| Interval { low, high });
         scores.intervals_are_reliable = is_reliable;
         scores.verdict()
+    }
+
+    #[test]
+    fn frames_of_the_training_are_told() {
+        let bootstrap = Bootstrap {
+            samples: 1,
+            seed: Seed(0),
+        };
+        let mut scores = SetScores::new(&[], &[], &bootstrap, true);
+        let told = |scores: &SetScores| scores.seen_frames();
+        assert_eq!(told(&scores), None);
+        scores.frames_of_training = Some(FramesOfTraining { sampled: 9, seen: 1 });
+        assert_eq!(told(&scores), None);
+        scores.frames_of_training = Some(FramesOfTraining { sampled: 9, seen: 7 });
+        let expected = "7 of 9 sampled frames were in the model's training, so this does not test what it never saw";
+        assert_eq!(told(&scores).as_deref(), Some(expected));
     }
 
     #[test]

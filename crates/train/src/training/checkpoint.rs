@@ -49,7 +49,7 @@ pub(super) struct RunFiles {
 
 impl RunFiles {
     /// Checks that the directory is unused, or contains a run with the same configuration and data. Writes nothing.
-    /// Errors: `NotARun`, `OtherRun`, `RenamedSettings`, `Io`.
+    /// Errors: `NotARun`, `OtherRun`, `Io`.
     pub(super) fn check(run_dir: &Path, config: &TrainConfig, content_hash: &str) -> Result<Self, TrainError> {
         let files = Self {
             run_dir: run_dir.to_owned(),
@@ -63,9 +63,6 @@ impl RunFiles {
                 (&data, &files.content_hash, "data set"),
             ] {
                 let found = fs::read_to_string(path).map_err(io_failed("read", path))?;
-                if found.lines().any(|line| line == "[fit]") {
-                    return Err(TrainError::RenamedSettings(run_dir.to_owned()));
-                }
                 if found != *expected {
                     let run_dir = run_dir.to_owned();
                     return Err(TrainError::OtherRun { run_dir, what });

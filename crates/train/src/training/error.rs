@@ -45,13 +45,10 @@ pub enum TrainError {
         /// `configuration` or `data set`.
         what: &'static str,
     },
-    /// The directory holds a run from before a group of its settings was renamed.
-    #[error("`fit` is now called `sequence`, so the run in {} cannot be resumed; use a new directory", .0.display())]
-    RenamedSettings(PathBuf),
     /// The training split or the validation split has no window.
     #[error(
         "the data set \"{dataset}\" has {train} training windows and {validation} validation windows of {frames} frames; training needs \
-         at least 1 of each: collect 40 trials or more"
+         at least 1 of each: collect 40 trials or more, or record longer without interruption"
     )]
     NoWindows {
         /// The data set's name.
@@ -167,7 +164,7 @@ impl HasErrorKind for TrainError {
             | Self::ConstantActions { .. }
             | Self::OtherUnits { .. }
             | Self::NoWindows { .. } => ErrorKind::Usage,
-            Self::NotARun(_) | Self::OtherRun { .. } | Self::RenamedSettings(_) => ErrorKind::Conflict,
+            Self::NotARun(_) | Self::OtherRun { .. } => ErrorKind::Conflict,
             Self::OtherNetwork { .. } | Self::Checkpoint { .. } | Self::Frame(_) => ErrorKind::Unusable,
             Self::Busy(_) => ErrorKind::Busy,
             Self::Diverged { .. } | Self::Io { .. } | Self::Optimizer(_) => ErrorKind::Internal,

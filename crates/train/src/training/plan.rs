@@ -5,6 +5,7 @@ use super::batches::FrameSource;
 use super::config::{Mirror, TrainConfig, WindowBudget};
 use super::state::TrainState;
 use super::{START_KEY, TrainError, Training};
+use crate::frame_marks;
 use foreframe_core::nn::ModelSpec;
 use foreframe_core::nn::spec::MIN_CHANNEL_STD;
 use foreframe_core::registry::{DatasetShare, DatasetStamp, Manifest, ProgramStamp};
@@ -105,6 +106,14 @@ impl<'a> TrainingPlan<'a> {
                 "weights_sha256": start.manifest.weights_sha256,
             });
         }
+        let mut marks = frame_marks::of_windows(training.dataset, &self.train, config.window_shape().frames())?;
+        // Frames of the model that it started from are no test of this one either.
+        marks.extend(
+            training
+                .start
+                .iter()
+                .flat_map(|start| &start.manifest.dataset.frame_marks),
+        );
         Ok(Manifest {
             name: config.name.clone(),
             version: 1,
@@ -117,6 +126,7 @@ impl<'a> TrainingPlan<'a> {
                 windows: self.train.len(),
                 split_seed: config.data.split_seed,
                 parts: self.shares(),
+                frame_marks: frame_marks::kept(marks),
             },
             seed: config.seed,
             command: training.command.to_owned(),

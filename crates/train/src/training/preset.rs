@@ -92,10 +92,6 @@ fn extract(
     defaults: SettingsLayer,
     layers: impl IntoIterator<Item = SettingsLayer>,
 ) -> Result<TrainConfig, TrainError> {
-    let layers: Vec<SettingsLayer> = layers.into_iter().collect();
-    for layer in std::iter::once(&defaults).chain(&layers) {
-        layer.refuse_renamed("fit", "sequence")?;
-    }
     let values = LayeredSettings::merge(defaults, layers, LISTING)?;
     Ok(values.extract(expected)?)
 }
@@ -173,20 +169,6 @@ mod tests {
         assert_eq!(
             error,
             "unknown field `stepz` in `sequence` (--set); `foreframe train --print-config` lists all settings"
-        );
-    }
-
-    #[test]
-    fn the_old_name_of_sequence_training_is_refused_with_its_new_one() {
-        let message =
-            |file, settings: &[String]| TrainConfig::layered("paper", file, settings).unwrap_err().to_string();
-        assert_eq!(
-            message(Some("[fit]\nsteps = 10\n"), &[]),
-            "`fit` is now called `sequence` (settings)"
-        );
-        assert_eq!(
-            message(None, &["fit.steps=3".to_owned()]),
-            "`fit` is now called `sequence` (--set)"
         );
     }
 

@@ -106,7 +106,7 @@ impl StageRunner<'_> {
                 is_validated,
             })?;
             if is_validated {
-                Self::validate(objective, state, loss, journal)?;
+                Self::validate(objective, state, loss, journal, &diverged)?;
             }
             if step.is_multiple_of(run.checkpoint_every_steps) || step == steps {
                 self.save(state, journal)?;
@@ -121,7 +121,7 @@ impl StageRunner<'_> {
         let (parameters, step, count) = (&state.parameters, state.progress.step, self.config.run.batch_parts);
         let gradients = |index| -> Result<Gradients, TrainError> {
             let loss = objective.loss(parameters, step, BatchPart { index, count })?;
-            Ok(Gradients::of(&loss, parameters, &[])?)
+            Ok(Gradients::of(&loss, parameters)?)
         };
         let parts: Vec<_> = (0..count).into_par_iter().map(gradients).collect();
         // Of several errors, the first part's, so that it is the same in each run.
@@ -146,10 +146,16 @@ impl StageRunner<'_> {
         state: &mut TrainState,
         train_loss: f64,
         journal: &mut Journal<'_>,
+        diverged: &dyn Fn(String) -> TrainError,
     ) -> Result<(), TrainError> {
         let progress = &mut state.progress;
         let (stage, step) = (progress.stage, progress.step);
         let loss = objective.validation_loss(&state.parameters)?;
+        if !(0.0..=MAX_LOSS).contains(&loss) {
+            return Err(diverged(format!(
+                "the validation loss is {loss:.1}, more than {MAX_LOSS}"
+            )));
+        }
         let is_best = progress.best_loss.is_none_or(|best| loss < best);
         if is_best {
             state.best = state.parameters.snapshot()?;

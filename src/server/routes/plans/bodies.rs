@@ -14,7 +14,7 @@ use crate::server::routes::picture;
 use foreframe_core::frame::Frame;
 use foreframe_core::frame::resize::Resize;
 use foreframe_core::frame::warp::CameraModel;
-use foreframe_core::planning::{PlanContext, PlannerInput};
+use foreframe_core::planning::PlannerInput;
 use foreframe_core::registry::Manifest;
 use foreframe_core::serving::Task;
 
@@ -76,7 +76,7 @@ impl PlanRequest {
         wanted: ResponseFormat,
         manifest: &Manifest,
         config: &ServerConfig,
-    ) -> Result<(Vec<Frame>, PlanContext, PlannerInput), ApiError> {
+    ) -> Result<(Vec<Frame>, Task, PlannerInput), ApiError> {
         let images = ImageInput {
             format: self.format,
             resize: self.resize,
@@ -97,6 +97,6 @@ impl PlanRequest {
             config,
         };
         let input = given.input(self.goal, self.search, reading)?;
-        Ok((seen, PlanContext::new(task), input))
+        Ok((seen, task, input))
     }
 }

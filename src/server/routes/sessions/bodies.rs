@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::server::http::problem::ApiError;
 use crate::server::images::ImageFormat;
+use crate::server::request_inputs;
 use crate::server::state::App;
 use crate::server::stream::protocol::{OnGap, OnLate, SessionSettings, StreamLimits};
 use crate::server::stream::session::Session;
@@ -89,6 +90,7 @@ pub(super) struct SessionDescription {
     /// Whether a stream is open.
     pub(super) connected: bool,
     /// Milliseconds until it expires unless it is used; absent while a stream is open.
+    #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) expires_in_ms: Option<u64>,
     /// The path of its WebSocket.
     pub(super) stream: String,
@@ -100,6 +102,7 @@ pub(super) struct SessionList {
     /// In the order of their ids.
     pub(super) sessions: Vec<SessionDescription>,
     /// The value of `after` for the next page; absent on the last page.
+    #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) next: Option<String>,
 }
 
@@ -145,6 +148,7 @@ impl CreateSession {
             format: format.or(exported.format.map(ImageFormat::answer)),
             resize: resize.or(exported.resize),
         };
+        request_inputs::check_steps(exported.snapshot.steps, manifest, app.config())?;
         let mut state = SessionState::restore(exported.snapshot, manifest)
             .map_err(|error| ApiError::Unprocessable(format!("state.{error}")))?;
         if let Some(camera) = camera {

@@ -4,6 +4,7 @@ use axum::extract::ws::Message;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
+use crate::server::http::extract::Object;
 use crate::server::msgpack::{self, MsgpackError};
 
 /// The sub-protocol for people and browsers.
@@ -68,11 +69,12 @@ impl Codec {
 
     /// Reads a message. Errors name the field.
     pub fn decode<T: DeserializeOwned>(self, message: &Message) -> Result<T, CodecError> {
-        match (self, message) {
-            (Self::Json, Message::Text(text)) => from_json(text),
-            (Self::Msgpack, Message::Binary(bytes)) => Ok(msgpack::read(bytes)?),
-            _ => Err(CodecError::Kind(self)),
-        }
+        let Object(message) = match (self, message) {
+            (Self::Json, Message::Text(text)) => from_json(text)?,
+            (Self::Msgpack, Message::Binary(bytes)) => msgpack::read(bytes)?,
+            _ => return Err(CodecError::Kind(self)),
+        };
+        Ok(message)
     }
 
     /// Writes a message.
@@ -170,6 +172,7 @@ mod tests {
         let unknown = text(r#"{"type":"frame","seq":0,"timestamp_us":0,"image":"","colour":1}"#);
         assert!(unknown.contains("unknown field `colour`"), "{unknown}");
         assert!(text(r#"{"type":"close","why":1}"#).contains("unknown field `why`"));
+        assert!(text(r#"["ping",null,5]"#).contains("expected an object"));
         assert!(text(r#"{"type":"dance"}"#).contains("expected one of `frame`, `configure`, `ping`, `close`"));
         assert!(text(r#"{"type":"frame","seq":0,"timestamp_us":0,"image":"%"}"#).contains("the image is not base64"));
         let Message::Binary(whole) = Codec::Msgpack.encode(&frame(0, vec![1], None)) else {

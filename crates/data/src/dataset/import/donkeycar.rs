@@ -113,7 +113,7 @@ pub(super) fn open(tub: &Path, options: &ImportOptions) -> Result<Recording, Imp
         states: manifest.named(&options.states, "--state")?,
     };
     let (mut records, mut paths, mut skipped) = (Vec::new(), Vec::new(), SkippedList::default());
-    let mut marked = 0;
+    let (mut marked, mut left_out) = (0, false);
     for catalog in &manifest.catalogs {
         let path = inside(tub, catalog, &tub.join(MANIFEST).display().to_string())?;
         let file = open_file(&path)?;
@@ -125,12 +125,21 @@ pub(super) fn open(tub: &Path, options: &ImportOptions) -> Result<Recording, Imp
                 .map_err(|reason| ImportError::record(&place, reason))
                 .and_then(|line| reader.record(&line, &place));
             match parsed {
-                Ok((index, _, _)) if !options.include_deleted && manifest.deleted.contains(&index) => marked += 1,
+                Ok((index, _, _)) if !options.include_deleted && manifest.deleted.contains(&index) => {
+                    (marked, left_out) = (marked + 1, true);
+                }
                 Ok((_, image, record)) => {
-                    records.push(record);
+                    let begins_episode = std::mem::take(&mut left_out);
+                    records.push(Record {
+                        begins_episode,
+                        ..record
+                    });
                     paths.push(image);
                 }
-                Err(error) => error.leave_out(options.skip_bad, &mut skipped)?,
+                Err(error) => {
+                    error.leave_out(options.skip_bad, &mut skipped)?;
+                    left_out = true;
+                }
             }
         }
     }

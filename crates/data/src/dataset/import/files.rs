@@ -61,7 +61,7 @@ pub(super) fn inside(folder: &Path, name: &str, place: &str) -> Result<PathBuf, 
     let is_inside = parts.all(|part| matches!(part, Component::Normal(_) | Component::CurDir));
     if name.is_empty() || !is_inside {
         let reason = format!(
-            "the image's name is {name:?}; it must be a file below {}",
+            "the file's name is {name:?}; it must be a file below {}",
             folder.display()
         );
         return Err(ImportError::record(place, reason));

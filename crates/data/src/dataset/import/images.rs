@@ -41,7 +41,7 @@ fn csv_file(folder: &Path, options: &ImportOptions) -> Result<Option<PathBuf>, I
     if let Some(csv) = &options.csv {
         return Ok(Some(csv.clone()));
     }
-    let mut found = entries(folder)?;
+    let mut found = own_entries(folder)?;
     found.retain(|path| extension(path) == "csv");
     match found.as_slice() {
         [] => Ok(None),
@@ -55,9 +55,19 @@ fn csv_file(folder: &Path, options: &ImportOptions) -> Result<Option<PathBuf>, I
     }
 }
 
+/// What is in a folder, without the files in which macOS keeps attributes of others.
+fn own_entries(folder: &Path) -> Result<Vec<PathBuf>, ImportError> {
+    let mut paths = entries(folder)?;
+    paths.retain(|path| {
+        let name = path.file_name().unwrap_or_default();
+        !name.to_string_lossy().starts_with("._")
+    });
+    Ok(paths)
+}
+
 fn without_csv(folder: &Path, options: &ImportOptions) -> Result<Recording, ImportError> {
     options.names_no_values("a folder of images without a CSV file")?;
-    let mut paths = entries(folder)?;
+    let mut paths = own_entries(folder)?;
     paths.retain(|path| ["png", "jpg", "jpeg"].contains(&extension(path).as_str()));
     if paths.is_empty() {
         return Err(ImportError::UnknownSource(folder.to_owned()));
@@ -82,7 +92,7 @@ fn with_csv(folder: &Path, csv: &Path, options: &ImportOptions) -> Result<Record
     let columns = header.columns()?;
     let (mut records, mut paths, mut skipped) = (Vec::new(), Vec::new(), SkippedList::default());
     let mut lines = reader.records();
-    let mut row = 0;
+    let (mut row, mut left_out) = (0, false);
     while let Some(line) = lines.next() {
         // The line after this one, since empty lines are not counted as records.
         let next = lines.reader().position().line();
@@ -96,10 +106,17 @@ fn with_csv(folder: &Path, csv: &Path, options: &ImportOptions) -> Result<Record
             });
         match parsed {
             Ok((path, record)) => {
-                records.push(record);
+                let begins_episode = std::mem::take(&mut left_out);
+                records.push(Record {
+                    begins_episode,
+                    ..record
+                });
                 paths.push(path);
             }
-            Err(error) => error.leave_out(options.skip_bad, &mut skipped)?,
+            Err(error) => {
+                error.leave_out(options.skip_bad, &mut skipped)?;
+                left_out = true;
+            }
         }
         row += 1;
     }
@@ -233,15 +250,15 @@ impl Header<'_> {
         Ok(Some((column, unit_s)))
     }
 
-    /// The columns named, else those whose names begin with the prefix. Errors: `Option`.
+    /// The columns named, else those whose names are the prefix or begin with it. Errors: `Option`.
     fn chosen(&self, names: &[String], prefix: &str) -> Result<Vec<usize>, ImportError> {
         if !names.is_empty() {
             let option = format!("--{prefix}");
             return names.iter().map(|name| self.named(name, &option)).collect();
         }
         let is_of = |&column: &usize| {
-            let rest = self.names[column].strip_prefix(prefix);
-            rest.is_some_and(|rest| rest.starts_with(['.', '_', '/']))
+            let rest = name_and_unit(&self.names[column]).0.strip_prefix(prefix);
+            rest.is_some_and(|rest| rest.is_empty() || rest.starts_with(['.', '_', '/']))
         };
         Ok((0..self.names.len()).filter(is_of).collect())
     }

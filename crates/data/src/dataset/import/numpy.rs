@@ -1,5 +1,5 @@
 //! `NumPy` arrays of frames (`.npy`): T×H×W, or many sequences as T×N×H×W or N×T×H×W (the shorter of the two first sides
-//! is time, as in Moving MNIST's test file), as bytes or as floating-point numbers 0…1, in gray, or as bytes in RGB.
+//! is time, as in Moving MNIST's test file), as bytes or as floating-point numbers 0…1, in gray or RGB.
 //!
 //! The header is parsed here, not by the crate `npyz`: it allocates whatever length a header states, up to 4 GiB.
 
@@ -91,8 +91,15 @@ impl ArrayHeader {
         let (kind, _) = kind.ok_or_else(|| wrong("its header names no type"))?;
         let number = match kind {
             "|u1" | "<u1" | ">u1" | "u1" => NumberType::U8,
+            "|b1" => NumberType::Bool,
+            "|i1" => NumberType::I8,
+            "<i2" => NumberType::I16,
+            "<u2" => NumberType::U16,
+            "<f2" => NumberType::F16,
             "<i4" => NumberType::I32,
+            "<u4" => NumberType::U32,
             "<i8" => NumberType::I64,
+            "<u8" => NumberType::U64,
             "<f4" => NumberType::F32,
             "<f8" => NumberType::F64,
             kind if kind.contains('O') => {
@@ -101,7 +108,8 @@ impl ArrayHeader {
             }
             other => {
                 return Err(wrong(&format!(
-                    "its values have type {other}; frames must be uint8, or float32 or float64 (little endian) from 0 to 1"
+                    "its values have type {other}; frames must be uint8, or float32 or float64 (little endian) from 0 to 1; other \
+                     numbers little-endian integers or floats of at most 64 bits"
                 )));
             }
         };

@@ -3,6 +3,8 @@
 use std::path::PathBuf;
 use std::sync::atomic::AtomicBool;
 
+use arrow_array::types::{ArrowPrimitiveType, Float16Type};
+
 use super::error::ImportError;
 use super::recording::{ImageSource, Record};
 use foreframe_core::files::PositionedFile;
@@ -11,29 +13,45 @@ use foreframe_core::frame::{Frame, MAX_SIDE_PX, codec};
 /// How a number is stored: little endian.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum NumberType {
+    Bool,
+    I8,
     U8,
+    I16,
+    U16,
+    F16,
     I32,
-    I64,
+    U32,
     F32,
+    I64,
+    U64,
     F64,
 }
 
 impl NumberType {
     pub(super) fn bytes(self) -> usize {
         match self {
-            Self::U8 => 1,
-            Self::I32 | Self::F32 => 4,
-            Self::I64 | Self::F64 => 8,
+            Self::Bool | Self::I8 | Self::U8 => 1,
+            Self::I16 | Self::U16 | Self::F16 => 2,
+            Self::I32 | Self::U32 | Self::F32 => 4,
+            Self::I64 | Self::U64 | Self::F64 => 8,
         }
     }
 
     pub(super) fn values(self, bytes: &[u8]) -> Vec<f64> {
+        type Half = <Float16Type as ArrowPrimitiveType>::Native;
+        let twos = bytes.as_chunks::<2>().0.iter();
         let (fours, eights) = (bytes.as_chunks::<4>().0.iter(), bytes.as_chunks::<8>().0.iter());
         match self {
-            Self::U8 => bytes.iter().map(|&value| f64::from(value)).collect(),
+            Self::Bool | Self::U8 => bytes.iter().map(|&value| f64::from(value)).collect(),
+            Self::I8 => bytes.iter().map(|&value| f64::from(value.cast_signed())).collect(),
+            Self::I16 => twos.map(|bytes| f64::from(i16::from_le_bytes(*bytes))).collect(),
+            Self::U16 => twos.map(|bytes| f64::from(u16::from_le_bytes(*bytes))).collect(),
+            Self::F16 => twos.map(|bytes| f64::from(Half::from_le_bytes(*bytes))).collect(),
             Self::I32 => fours.map(|bytes| f64::from(i32::from_le_bytes(*bytes))).collect(),
+            Self::U32 => fours.map(|bytes| f64::from(u32::from_le_bytes(*bytes))).collect(),
             Self::F32 => fours.map(|bytes| f64::from(f32::from_le_bytes(*bytes))).collect(),
             Self::I64 => eights.map(|bytes| i64::from_le_bytes(*bytes) as f64).collect(),
+            Self::U64 => eights.map(|bytes| u64::from_le_bytes(*bytes) as f64).collect(),
             Self::F64 => eights.map(|bytes| f64::from_le_bytes(*bytes)).collect(),
         }
     }
@@ -56,13 +74,16 @@ impl FrameLayout {
     /// Errors: `Record` if the array holds no frames.
     pub(super) fn of(number: NumberType, shape: &[usize], place: &str) -> Result<Self, ImportError> {
         let wrong = |reason: String| Err(ImportError::record(place, reason));
-        if matches!(number, NumberType::I32 | NumberType::I64) {
-            let reason = "its values are int32 or int64; frames must be uint8, or float32 or float64 from 0 to 1";
+        if !matches!(number, NumberType::U8 | NumberType::F32 | NumberType::F64) {
+            let reason = "its values have another type; frames must be uint8, or float32 or float64 from 0 to 1";
             return wrong(reason.to_owned());
         }
-        // Frames of three columns are not worth predicting, so these are colors.
+        if let Some(right) = misplaced_channels(shape) {
+            return wrong(format!("the array's shape is {shape:?}; {right}"));
+        }
+        // Frames of one or three columns are not worth predicting, so these are channels.
         let (sides, is_rgb) = match shape {
-            [sides @ .., 3] if sides.len() >= 3 && number == NumberType::U8 => (sides, true),
+            [sides @ .., channels @ (1 | 3)] if sides.len() >= 3 => (sides, *channels == 3),
             sides => (sides, false),
         };
         let (sequences, frames, height, width, time_first) = match *sides {
@@ -71,7 +92,7 @@ impl FrameLayout {
             [sequences, frames, height, width] => (sequences, frames, height, width, false),
             _ => {
                 return wrong(format!(
-                    "the array's shape is {shape:?}; it must be T×H×W, T×N×H×W or N×T×H×W, or the same with 3 colors at the end"
+                    "the array's shape is {shape:?}; it must be T×H×W, T×N×H×W or N×T×H×W, or the same with 1 or 3 channels at the end"
                 ));
             }
         };
@@ -120,6 +141,22 @@ impl FrameLayout {
     }
 }
 
+/// What to do about an array whose channels would be taken for columns or frames.
+fn misplaced_channels(shape: &[usize]) -> Option<&'static str> {
+    match shape {
+        [_, _, _, .., 2] => Some("2 channels are not read; keep one of them, as in frames[..., 0]"),
+        [_, _, _, .., 4] => Some("4 channels are not read; keep red, green and blue: frames[..., :3]"),
+        [_, _, _, 1 | 3] => None,
+        [frames, 1, _, _] if *frames > 1 => {
+            Some("a single channel must not come before the rows; leave it out: frames[:, 0]")
+        }
+        [frames, 3, _, _] if *frames > 3 => {
+            Some("the 3 colors must come last; use numpy.transpose(frames, (0, 2, 3, 1)).copy()")
+        }
+        _ => None,
+    }
+}
+
 /// A frame of an array.
 pub(super) struct FramePosition {
     pub(super) sequence: usize,
@@ -161,7 +198,12 @@ impl ImageSource for RawImages {
             NumberType::U8 => bytes,
             number => {
                 let levels = number.values(&bytes).into_iter().map(|value| gray_level(value, place));
-                levels.collect::<Result<_, _>>()?
+                let levels: Vec<u8> = levels.collect::<Result<_, _>>()?;
+                if layout.is_rgb {
+                    codec::gray_from_rgb(&levels)
+                } else {
+                    levels
+                }
             }
         };
         let frame = Frame::new(layout.width as u32, layout.height as u32, pixels);
@@ -192,5 +234,42 @@ mod tests {
         assert_eq!(of_digits.position(3 * 20 + 2).index, 2 * 10000 + 3);
         let colors = layout(NumberType::U8, &[9, 48, 64, 3]);
         assert_eq!((colors.frames, colors.width, colors.is_rgb), (9, 64, true));
+    }
+
+    #[test]
+    fn channels_are_never_columns_or_frames() {
+        for number in [NumberType::U8, NumberType::F32] {
+            let (gray, colors) = (layout(number, &[100, 48, 64, 1]), layout(number, &[100, 48, 64, 3]));
+            assert_eq!((gray.frames, gray.width, gray.is_rgb), (100, 64, false));
+            assert_eq!((colors.frames, colors.width, colors.is_rgb), (100, 64, true));
+            for (shape, right) in [
+                ([100, 48, 64, 2], "frames[..., 0]"),
+                ([100, 48, 64, 4], "frames[..., :3]"),
+                ([100, 1, 48, 64], "frames[:, 0]"),
+                ([100, 3, 48, 64], "numpy.transpose(frames, (0, 2, 3, 1))"),
+            ] {
+                let error = FrameLayout::of(number, &shape, "a.npy").err().unwrap().to_string();
+                assert!(error.contains(right), "{error}");
+            }
+        }
+    }
+
+    #[test]
+    fn numbers_of_every_type_are_read() {
+        for (number, bytes, expected) in [
+            (NumberType::Bool, &[1u8][..], 1.0),
+            (NumberType::I8, &[0xff], -1.0),
+            (NumberType::I16, &[0xfe, 0xff], -2.0),
+            (NumberType::U16, &[0xfe, 0xff], 65534.0),
+            (NumberType::F16, &[0x00, 0xbe], -1.5),
+            (NumberType::U32, &[0, 0, 0, 0x80], 2_147_483_648.0),
+            (
+                NumberType::U64,
+                &[0, 0, 0, 0, 0, 0, 0, 0x80],
+                9_223_372_036_854_775_808.0,
+            ),
+        ] {
+            assert_eq!((number.bytes(), number.values(bytes)), (bytes.len(), vec![expected]));
+        }
     }
 }

@@ -16,6 +16,8 @@ pub(super) struct Record {
     pub(super) timestamp_s: f64,
     /// Records of different sessions are never in one episode.
     pub(super) session: String,
+    /// Whether something was left out just before it, so that it begins an episode.
+    pub(super) begins_episode: bool,
     pub(super) action: Vec<f32>,
     pub(super) state: Vec<f32>,
     /// Which of [`Recording::images`] it is; [`Recording::new`] sets it.

@@ -1,8 +1,9 @@
 //! From records to episodes at one frame rate.
 //!
-//! The rule: records of one session follow each other until time jumps by more than 3 median periods; that ends an
-//! episode. Without a rate, every Nth record becomes a frame. With a rate, frame k of an episode is the record nearest to
-//! its start + k / rate, if one lies within half a period; if none does, the episode ends. The action of a frame is the mean
+//! The rule: records of one session follow each other until time jumps by more than 3.5 median periods or one was left
+//! out; that ends an episode. Without a rate, every Nth record becomes a frame. With a rate, frame k of an episode is the record
+//! nearest to its start + k / rate, if one lies within half a period; if none does, the episode ends. At a rate near to the
+//! recorded one every record becomes a frame, and the episode ends where one is missing. The action of a frame is the mean
 //! of the records' actions from this frame up to the next one. Its state is that of its record. Very long episodes are cut.
 
 use std::cmp::Ordering;
@@ -11,9 +12,12 @@ use std::path::Path;
 
 use super::recording::{Record, Recording};
 use super::{ImportError, ImportOptions, SkippedItem};
+use crate::dataset::sampler::GAP_PERIODS;
 
-/// A jump of time by more than this many median periods ends an episode.
-pub(super) const GAP_PERIODS: u32 = 3;
+/// A jump of time by more than this many periods ends an episode whose rate was given.
+const MISSING_FRAME_PERIODS: f64 = 1.5;
+/// Seconds since 1970 stay below it for 3,000 years; milliseconds do not.
+const MAX_TIME_S: f64 = 1e11;
 /// The median time from one record to the next: the reach of `--rate`.
 const PERIODS_S: RangeInclusive<f64> = 0.001..=100.0;
 /// Longer episodes are cut, if their frames are more than `MIN_LONGEST_FRAMES`.
@@ -45,23 +49,22 @@ pub(super) fn plan(mut recording: Recording, options: &ImportOptions) -> Result<
     let empty = |name: &Path| ImportError::Empty(name.to_owned());
     let name = Path::new(&recording.name);
     let period_s = median_period(records).ok_or_else(|| empty(options.csv.as_deref().unwrap_or(name)))?;
-    if !PERIODS_S.contains(&period_s) {
-        return Err(ImportError::Option(format!(
-            "the times of {:?} are {period_s} s apart (median); {} to {} s are possible. Times are in seconds unless their name \
-             ends with _ms, _us or _ns",
-            recording.name,
-            PERIODS_S.start(),
-            PERIODS_S.end()
-        )));
-    }
-    let (frame_period_s, resampled) = match options.rate_hz {
-        Some(rate) if (rate * period_s - 1.0).abs() > RATE_TOLERANCE => (1.0 / rate, true),
-        Some(rate) => (1.0 / rate, false),
-        None => (whole_rate(period_s), false),
+    check_unit(&recording, period_s)?;
+    let (frame_period_s, resampled, gap_periods) = match options.rate_hz {
+        Some(rate) if rate * period_s > 1.0 + RATE_TOLERANCE => {
+            return Err(ImportError::Option(format!(
+                "--rate is {rate}, but {:?} has only {} frames per second (median); give this rate or a lower one",
+                recording.name,
+                (1e3 / period_s).round() / 1e3
+            )));
+        }
+        Some(rate) if rate * period_s < 1.0 - RATE_TOLERANCE => (1.0 / rate, true, GAP_PERIODS),
+        Some(rate) => (1.0 / rate, false, MISSING_FRAME_PERIODS),
+        None => (whole_rate(period_s), false, GAP_PERIODS),
     };
     let longest = longest_episode(options);
     let mut episodes = Vec::new();
-    for segment in segments(records, f64::from(GAP_PERIODS) * period_s) {
+    for segment in segments(records, gap_periods * period_s) {
         let picked = if resampled {
             nearest(records, segment, frame_period_s)
         } else {
@@ -89,6 +92,24 @@ pub(super) fn plan(mut recording: Recording, options: &ImportOptions) -> Result<
     })
 }
 
+/// Errors: `Option` if the times cannot be in seconds.
+fn check_unit(recording: &Recording, period_s: f64) -> Result<(), ImportError> {
+    let name = &recording.name;
+    let wrong = if PERIODS_S.contains(&period_s) {
+        let mut times = recording.records.iter().map(|record| record.timestamp_s);
+        match times.find(|time_s| time_s.abs() > MAX_TIME_S) {
+            Some(time_s) => format!("a time of {name:?} is {time_s} s; at most {MAX_TIME_S} s are possible"),
+            None => return Ok(()),
+        }
+    } else {
+        let (least, most) = (PERIODS_S.start(), PERIODS_S.end());
+        format!("the times of {name:?} are {period_s} s apart (median); {least} to {most} s are possible")
+    };
+    Err(ImportError::Option(format!(
+        "{wrong}. Times are in seconds unless their name ends with _ms, _us or _ns"
+    )))
+}
+
 /// Data sets store the times since the episode's start with 24 bits. Errors: `Option` if two of them would be the same.
 fn check_stored_times(records: &[Record], frames: &[PlannedFrame]) -> Result<(), ImportError> {
     let time_s = |frame: &PlannedFrame| records[frame.record].timestamp_s;
@@ -111,10 +132,12 @@ fn longest_episode(options: &ImportOptions) -> usize {
 }
 
 /// Refuses records whose time is not after the one before in their session, or leaves them out. A single time that is too late is
-/// left out itself, not those after it.
+/// left out itself, not those after it. What follows begins an episode.
 fn drop_backward_times(recording: &mut Recording, options: &ImportOptions) -> Result<(), ImportError> {
     let mut kept: Vec<Record> = Vec::with_capacity(recording.records.len());
-    for record in std::mem::take(&mut recording.records) {
+    let mut left_out = false;
+    for mut record in std::mem::take(&mut recording.records) {
+        record.begins_episode |= std::mem::take(&mut left_out);
         let last = kept.last().filter(|last| last.session == record.session);
         let Some(last) = last.filter(|last| record.timestamp_s <= last.timestamp_s) else {
             kept.push(record);
@@ -127,9 +150,11 @@ fn drop_backward_times(recording: &mut Recording, options: &ImportOptions) -> Re
             );
             recording.skipped.push(SkippedItem::new(&last.place, &reason));
             kept.pop();
+            record.begins_episode = true;
             kept.push(record);
             continue;
         }
+        left_out = true;
         let reason = format!(
             "its time {} s is not after the one before, {} s; times must grow",
             record.timestamp_s, last.timestamp_s
@@ -145,8 +170,13 @@ fn fits_after(before: Option<&Record>, record: &Record) -> bool {
     before.is_none_or(|before| before.session != record.session || before.timestamp_s < record.timestamp_s)
 }
 
+/// Whether two records can be in one episode: nothing between them was left out.
+fn is_next(before: &Record, now: &Record) -> bool {
+    before.session == now.session && !now.begins_episode
+}
+
 fn median_period(records: &[Record]) -> Option<f64> {
-    let pairs = records.windows(2).filter(|pair| pair[0].session == pair[1].session);
+    let pairs = records.windows(2).filter(|pair| is_next(&pair[0], &pair[1]));
     let steps = pairs.map(|pair| pair[1].timestamp_s - pair[0].timestamp_s);
     median(steps.collect(), f64::total_cmp)
 }
@@ -170,9 +200,8 @@ fn whole_rate(period_s: f64) -> f64 {
 
 /// Ranges of records without a gap.
 fn segments(records: &[Record], max_step_s: f64) -> impl Iterator<Item = Range<usize>> {
-    let follows = move |before: &Record, now: &Record| {
-        before.session == now.session && now.timestamp_s - before.timestamp_s <= max_step_s
-    };
+    let follows =
+        move |before: &Record, now: &Record| is_next(before, now) && now.timestamp_s - before.timestamp_s <= max_step_s;
     let mut start = 0;
     records.chunk_by(follows).map(move |segment| {
         let range = start..start + segment.len();
@@ -299,7 +328,73 @@ mod tests {
             ..ImportOptions::default()
         };
         let plan = plan(recording(&times), &options).unwrap();
-        assert_eq!((plan.recording.skipped.items(9).len(), plan.episodes[0].len()), (1, 4));
+        // The time 0.1 s is too late, since 0.05 s follows 0 s. The episode ends there.
+        let kept: Vec<usize> = plan.episodes[0].iter().map(|frame| frame.record).collect();
+        assert_eq!((plan.recording.skipped.items(9).len(), kept), (1, vec![1, 2, 3]));
+        assert_eq!(plan.recording.records[1].timestamp_s, 0.05);
+    }
+
+    #[test]
+    fn an_episode_ends_where_a_time_is_repeated_and_left_out() {
+        let options = ImportOptions {
+            skip_bad: true,
+            ..ImportOptions::default()
+        };
+        let episodes = planned(&[0.0, 0.1, 0.2, 0.2, 0.4, 0.5], &options);
+        let actions: Vec<Vec<f32>> = episodes
+            .iter()
+            .map(|frames| frames.iter().map(|frame| frame.1).collect())
+            .collect();
+        assert_eq!(actions, [vec![0.0, 1.0, 2.0], vec![4.0, 5.0]]);
+    }
+
+    #[test]
+    fn an_episode_of_a_given_rate_ends_where_a_frame_is_missing() {
+        let times = [0.0, 0.1, 0.21, 0.3, 0.5, 0.6, 0.7];
+        let lengths = |rate_hz| {
+            let options = ImportOptions {
+                rate_hz,
+                ..ImportOptions::default()
+            };
+            planned(&times, &options).iter().map(Vec::len).collect::<Vec<_>>()
+        };
+        assert_eq!((lengths(None), lengths(Some(10.0))), (vec![7], vec![4, 3]));
+    }
+
+    #[test]
+    fn a_rate_above_the_recorded_one_is_refused() {
+        let options = ImportOptions {
+            rate_hz: Some(50.0),
+            ..ImportOptions::default()
+        };
+        let error = plan(recording(&[0.0, 0.05, 0.1, 0.15]), &options).err().unwrap();
+        assert_eq!(
+            error.to_string(),
+            "--rate is 50, but \"test\" has only 20 frames per second (median); give this rate or a lower one"
+        );
+    }
+
+    #[test]
+    fn three_periods_are_no_gap_wherever_the_clock_starts() {
+        for start_s in [0.0, 0.7, 1_700_000_000.0] {
+            let times = [0.0, 0.1, 0.2, 0.3, 0.6, 0.7, 0.8, 1.2, 1.3].map(|time_s| start_s + time_s);
+            let lengths: Vec<usize> = planned(&times, &ImportOptions::default())
+                .iter()
+                .map(Vec::len)
+                .collect();
+            assert_eq!(lengths, [7, 2], "{start_s}");
+        }
+    }
+
+    #[test]
+    fn milliseconds_since_1970_are_not_taken_for_seconds() {
+        let times: Vec<f64> = (0..5).map(|index| 1.7e12 + f64::from(index) * 50.0).collect();
+        let error = plan(recording(&times), &ImportOptions::default())
+            .err()
+            .unwrap()
+            .to_string();
+        assert!(error.starts_with("a time of \"test\" is 1700000000000 s"), "{error}");
+        assert!(error.contains("_ms"), "{error}");
     }
 
     #[test]

@@ -74,7 +74,7 @@ impl Pipeline {
         let is_own = loaded.manifest.dataset.includes(&dataset.info().content_hash);
         let has_score = loaded.manifest.metrics.get("test").is_some();
         Ok(JobResult {
-            measured: (is_own || !has_score).then(|| ModelMetrics {
+            measured: ((is_own || !has_score) && !found.has_frames_of_training()).then(|| ModelMetrics {
                 model: spec.model.clone(),
                 version,
                 weights_sha256: loaded.manifest.weights_sha256.clone(),

@@ -35,6 +35,9 @@ impl CameraTurn {
         let poses = self.motion.poses(input).into_iter();
         poses
             .map(|pose| {
+                if pose.heading_rad == 0.0 {
+                    return last.to_vec();
+                }
                 let grid = rotation_grid(camera, self.width, self.height, pose.heading_rad);
                 sample(last, self.width, self.height, &grid).0
             })

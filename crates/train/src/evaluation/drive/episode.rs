@@ -47,7 +47,7 @@ pub struct EpisodeResult {
     pub time_s: f64,
     /// The way that it drove, in metres.
     pub way_m: f64,
-    /// The straight way, which is free but for other robots, in metres.
+    /// The straight way to where it arrives, which is free but for other robots, in metres.
     pub shortest_m: f64,
     /// The least distance to anything, in metres; at or below 0 it touched it.
     pub closest_m: f64,
@@ -64,7 +64,7 @@ impl EpisodeResult {
         self.arrived && self.collisions == 0
     }
 
-    /// `shortest_m`: the straight way; `gap_m`: the distance to the nearest thing.
+    /// `shortest_m`: the straight way to where the robot arrives; `gap_m`: the distance to the nearest thing.
     fn at_start(shortest_m: f32, gap_m: f32) -> Self {
         Self {
             arrived: false,
@@ -199,7 +199,7 @@ pub(super) fn drive(
             period_s,
         })
     };
-    let mut result = EpisodeResult::at_start(distance(&world, goal), world.gap_m());
+    let mut result = EpisodeResult::at_start(distance(&world, goal) - ARRIVAL_M, world.gap_m());
     let (mut frames, mut states) = (VecDeque::new(), VecDeque::new());
     let (mut views, recent) = (RobotViews::default(), (SEEN_S / period_s).round() as u64);
     let (mut was_touching, mut was_moving) = (false, false);
@@ -238,6 +238,10 @@ pub(super) fn drive(
         result.way_m += f64::from(distance(&world, [before.x_m, before.y_m]));
         result.closest_m = result.closest_m.min(f64::from(world.gap_m()));
         let touch = world.touch();
+        if touch.is_some() {
+            // The gap is that at the frame; it touched something since the last one.
+            result.closest_m = result.closest_m.min(0.0);
+        }
         if let Some(touch) = touch.filter(|_| !was_touching) {
             result.count(touch, touch.robot.is_some_and(|robot| !views.saw(robot, frame, recent)));
         }

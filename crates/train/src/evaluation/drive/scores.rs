@@ -4,7 +4,7 @@ use serde::Serialize;
 
 use super::episode::EpisodeResult;
 use super::settings::DriverKind;
-use crate::evaluation::bootstrap::{Bootstrap, Interval, TrialSums};
+use crate::evaluation::bootstrap::{Bootstrap, FEWEST_GROUPS, Interval, TrialSums};
 use foreframe_core::types::Seed;
 
 /// Resamples of the episodes.
@@ -46,6 +46,8 @@ pub struct DriverScores {
     pub stops: DriveScore,
     /// Median and 95 % quantile of the time of a choice, in milliseconds.
     pub planning_ms: [f64; 2],
+    /// Whether there are enough episodes to trust the intervals.
+    pub intervals_are_reliable: bool,
     /// The episodes.
     pub episodes: Vec<EpisodeResult>,
 }
@@ -124,6 +126,7 @@ impl DriverScores {
             closest_m: score(5),
             stops: score(6),
             planning_ms: [quantile(0.5), quantile(0.95)],
+            intervals_are_reliable: episodes.len() >= FEWEST_GROUPS,
             episodes,
         }
     }
@@ -160,5 +163,6 @@ mod tests {
         assert_eq!(scores.collisions_per_km.mean, 125.0);
         let interval = scores.success.interval.unwrap();
         assert!(interval.low < 0.5 && interval.high > 0.5);
+        assert!(!scores.intervals_are_reliable);
     }
 }

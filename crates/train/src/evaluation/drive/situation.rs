@@ -6,7 +6,7 @@ use super::error::DriveError;
 use foreframe_core::frame::Frame;
 use foreframe_core::frame::warp::CameraModel;
 use foreframe_core::nn::Occupancy;
-use foreframe_core::planning::{ActionLimit, PlanContext};
+use foreframe_core::planning::ActionLimit;
 use foreframe_core::registry::Model;
 use foreframe_core::serving::{ConditioningInput, Task, compute_task};
 use foreframe_core::types::{Action, RobotState};
@@ -75,7 +75,7 @@ impl RobotViews {
 
 impl Situation<'_> {
     /// The context of predictions.
-    pub(super) fn context(&self, model: &Model) -> Result<PlanContext, DriveError> {
+    pub(super) fn context(&self, model: &Model) -> Result<Task, DriveError> {
         let frames = self.frames.iter().cloned().collect();
         let past = self
             .states
@@ -84,14 +84,14 @@ impl Situation<'_> {
             .cloned()
             .collect();
         let task = Task::rollout(frames, past, Some(self.camera), Vec::new(), &model.manifest)?;
-        Ok(PlanContext::new(task))
+        Ok(task)
     }
 
     /// What the model sees around the robot, and where it expects movers.
     pub(super) fn occupancy(&self, model: &Model) -> Result<Occupancy, DriveError> {
         let plans = vec![vec![action([0.0, 0.0])?; model.spec().horizon]];
         let inputs = ConditioningInput::of_plans(plans, self.states.back().cloned(), None, &model.manifest)?;
-        let seen = compute_task(model, &self.context(model)?.task(inputs, true))?;
+        let seen = compute_task(model, &self.context(model)?.with_rollouts(inputs, true))?;
         Ok(seen.occupancy.unwrap_or_default())
     }
 }

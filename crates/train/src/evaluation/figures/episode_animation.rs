@@ -48,7 +48,7 @@ pub fn episode_gif(
     episode: usize,
 ) -> Result<Vec<u8>, DriveError> {
     let mut pictures = VecDeque::new();
-    let mut delay_ms = 0;
+    let mut period_s = 0.0;
     let mut view: Option<RoomView> = None;
     replay(model, settings, driver, episode, &mut |step| {
         let picture = camera_picture(step)?;
@@ -64,21 +64,21 @@ pub fn episode_gif(
             pictures.pop_front();
         }
         pictures.push_back(joined(&picture, &captions, &view.draw(step)?)?);
-        delay_ms = (step.period_s * 1000.0).round() as u32;
+        period_s = f64::from(step.period_s);
         Ok(())
     })?;
-    Ok(small_gif(&Vec::from(pictures), delay_ms, LARGE_BYTES)?)
+    Ok(small_gif(&Vec::from(pictures), period_s, LARGE_BYTES)?)
 }
 
 /// A GIF with as many gray values as the size limit allows. If even the fewest are too large, it exceeds the limit.
-fn small_gif(pictures: &[Frame], delay_ms: u32, large_bytes: usize) -> Result<Vec<u8>, FrameError> {
+fn small_gif(pictures: &[Frame], period_s: f64, large_bytes: usize) -> Result<Vec<u8>, FrameError> {
     let mut gif = Vec::new();
     for gray_step in GRAY_STEPS {
         let coarse: Vec<Frame> = pictures
             .iter()
             .map(|picture| coarser(picture, gray_step))
             .collect::<Result<_, _>>()?;
-        gif = codec::encode_gif(&coarse, delay_ms)?;
+        gif = codec::encode_gif(&coarse, period_s)?;
         if gif.len() <= large_bytes {
             break;
         }
@@ -313,10 +313,10 @@ mod tests {
     fn a_large_file_gets_fewer_gray_values() {
         let noise = (0..64 * 64u32).map(|pixel| (pixel.wrapping_mul(2_654_435_761) >> 24) as u8);
         let pictures = [Frame::new(64, 64, noise.collect()).unwrap()];
-        let fine = small_gif(&pictures, 200, LARGE_BYTES).unwrap();
-        let coarse = small_gif(&pictures, 200, fine.len() - 1).unwrap();
+        let fine = small_gif(&pictures, 0.2, LARGE_BYTES).unwrap();
+        let coarse = small_gif(&pictures, 0.2, fine.len() - 1).unwrap();
         assert!(coarse.len() < fine.len());
-        assert_eq!(small_gif(&pictures, 200, fine.len()).unwrap(), fine);
+        assert_eq!(small_gif(&pictures, 0.2, fine.len()).unwrap(), fine);
         let gray = Frame::new(4, 1, vec![0, 63, 192, 255]).unwrap();
         assert_eq!(coarser(&gray, 64).unwrap().pixels(), [0, 0, 255, 255]);
         assert_eq!(coarser(&gray, 8).unwrap().pixels(), [0, 57, 197, 255]);

@@ -149,10 +149,13 @@ impl TrainConfig {
             ));
         }
         if self.remembers_room() && (self.data.hidden > 0.0 || self.data.mirror != Mirror::Off) {
+            let now = match self.data.mirror {
+                Mirror::Off => format!("data.hidden is {}", self.data.hidden),
+                _ => "data.mirror is not off".to_owned(),
+            };
             return refused(format!(
-                "model.flow.memory is true, so set data.mirror to off and data.hidden to 0 (now {}): a mirrored room is another one, and \
-                 a hidden pose does not say where the room is seen from",
-                self.data.hidden
+                "model.flow.memory is true, so set data.mirror to off and data.hidden to 0 (now {now}): a mirrored room is another one, and \
+                 a hidden pose does not say where the room is seen from"
             ));
         }
         if sequence.short_share > 0.0 && !(1..=self.model.horizon).contains(&sequence.short_horizon) {

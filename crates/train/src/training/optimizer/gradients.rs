@@ -19,9 +19,8 @@ pub struct Gradients {
 }
 
 impl Gradients {
-    /// Gradients of the scalar `loss` for all parameters on which it depends, except those whose name starts with one of
-    /// the `frozen` prefixes. Errors: `LossNotFinite`.
-    pub fn of(loss: &Tensor, parameters: &Parameters, frozen: &[&str]) -> Result<Self, OptimizerError> {
+    /// Gradients of the scalar `loss` for all parameters on which it depends. Errors: `LossNotFinite`.
+    pub fn of(loss: &Tensor, parameters: &Parameters) -> Result<Self, OptimizerError> {
         let value = loss.to_dtype(DType::F64)?.to_scalar::<f64>()?;
         if !value.is_finite() {
             return Err(OptimizerError::LossNotFinite { value });
@@ -29,9 +28,6 @@ impl Gradients {
         let mut store = loss.backward()?;
         let mut by_name = BTreeMap::new();
         for (name, var) in parameters.iter() {
-            if frozen.iter().any(|prefix| name.starts_with(prefix)) {
-                continue;
-            }
             if let Some(gradient) = store.remove(var.as_tensor()) {
                 by_name.insert(name.to_owned(), gradient.detach().contiguous()?);
             }

@@ -41,7 +41,7 @@ impl ByteRange {
                 }
                 for (values, to) in values.chunks_exact(channels).zip(to.chunks_exact_mut(length)) {
                     // All of the last group, before some of it is overwritten: a few bytes alone would be a call.
-                    *to.last_chunk_mut().expect("places without channels are a bug") = [self.zero; size_of::<Group>()];
+                    *to.last_chunk_mut().expect("a place without channels is a bug") = [self.zero; size_of::<Group>()];
                     self.write_bytes(values, &mut to[..channels]);
                 }
             },

@@ -3,7 +3,8 @@
 //! The rule: a topic's times are those in its messages' headers if half of them lie within 1 s of the time at which they
 //! were recorded, else the latter. A value holds until the next one, at most for `hold_s`. The state of an image is the one
 //! that holds at its time. Its action is the mean of what holds from its time until the next image, each value weighted by
-//! how long it holds. An image without an action or a state is left out.
+//! how long it holds. An image without an action or a state is left out. What follows such an image, or a damaged one, begins an
+//! episode.
 
 use std::ops::Range;
 
@@ -11,8 +12,9 @@ use super::choice::{ChosenTopics, ChosenValues};
 use super::index::{BagIndex, MessageTime, Position};
 use crate::dataset::import::recording::Record;
 use crate::dataset::import::skipped::{SkippedItem, SkippedList};
-use crate::dataset::import::timing::{GAP_PERIODS, median};
+use crate::dataset::import::timing::median;
 use crate::dataset::import::{ImportError, ImportOptions};
+use crate::dataset::sampler::GAP_PERIODS;
 
 /// Headers that differ more from the time of recording, in the median, are of another clock.
 const SAME_CLOCK_NS: u64 = 1_000_000_000;
@@ -155,10 +157,11 @@ pub(super) fn join(index: &BagIndex<'_>, chosen: &ChosenTopics<'_>) -> Result<Jo
     let states = chosen.states.iter().map(&mut held).collect::<Result<Vec<_>, _>>()?;
     // Runs of images without an action or a state, with the topic that has no value.
     let mut left_out: Vec<(&str, Range<u64>)> = Vec::new();
+    let mut next_number = 0;
     for (image, entry) in images.iter().enumerate() {
         let start_ns = times_ns[image];
         let next_ns = times_ns.get(image + 1).copied().unwrap_or(i64::MAX);
-        let longest_ns = period_ns.saturating_mul(GAP_PERIODS.into());
+        let longest_ns = (period_ns as f64 * GAP_PERIODS) as i64;
         let is_next = next_ns > start_ns && next_ns.saturating_sub(start_ns) <= longest_ns;
         let end_ns = if is_next {
             next_ns
@@ -186,10 +189,12 @@ pub(super) fn join(index: &BagIndex<'_>, chosen: &ChosenTopics<'_>) -> Result<Jo
                 .flat_map(|(held, &first)| held.mean(first, start_ns, end_ns))
                 .collect(),
             state: state.flat_map(|(held, &at)| held.row(at).iter().copied()).collect(),
+            begins_episode: entry.number != next_number,
             place: index.place(chosen.image, entry),
             ..Record::default()
         });
         joined.positions.push((entry.file, entry.position));
+        next_number = entry.number + 1;
     }
     let (source, hold_s) = (index.source.display(), index.options.hold_s);
     for (topic, run) in left_out {

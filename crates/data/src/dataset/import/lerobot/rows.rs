@@ -5,8 +5,8 @@ use std::path::Path;
 
 use arrow_array::cast::AsArray;
 use arrow_array::types::{
-    ArrowPrimitiveType, Float32Type, Float64Type, Int8Type, Int16Type, Int32Type, Int64Type, UInt8Type, UInt16Type,
-    UInt32Type,
+    ArrowPrimitiveType, Float16Type, Float32Type, Float64Type, Int8Type, Int16Type, Int32Type, Int64Type, UInt8Type,
+    UInt16Type, UInt32Type,
 };
 use arrow_array::{Array, ArrayRef, RecordBatch};
 use arrow_schema::DataType;
@@ -110,6 +110,7 @@ fn numbers(array: &ArrayRef) -> Option<Vec<f64>> {
         values.map(|value| value.map_or(f64::NAN, &number)).collect()
     }
     Some(match array.data_type() {
+        DataType::Float16 => of::<Float16Type>(array, f64::from),
         DataType::Float32 => of::<Float32Type>(array, f64::from),
         DataType::Float64 => of::<Float64Type>(array, f64::from),
         DataType::Int8 => of::<Int8Type>(array, f64::from),
@@ -137,5 +138,21 @@ fn vectors_of(array: &ArrayRef) -> Option<Vec<Vec<f64>>> {
         DataType::LargeList(_) => array.as_list::<i64>().iter().map(|row| list(row?)).collect(),
         DataType::FixedSizeList(..) => array.as_fixed_size_list().iter().map(|row| list(row?)).collect(),
         _ => Some(numbers(array)?.into_iter().map(|value| vec![value]).collect()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use arrow_array::PrimitiveArray;
+
+    use super::*;
+
+    #[test]
+    fn floats_of_16_bits_are_numbers() {
+        let half = <Float16Type as ArrowPrimitiveType>::Native::from_f32(-1.5);
+        let array: ArrayRef = Arc::new(PrimitiveArray::<Float16Type>::from_iter_values([half]));
+        assert_eq!(numbers(&array), Some(vec![-1.5]));
     }
 }
