@@ -236,12 +236,9 @@ pub(super) fn drive(
         let before = world.observer_pose();
         let step = world.step(&Action::try_from(command.to_vec())?)?;
         result.way_m += f64::from(distance(&world, [before.x_m, before.y_m]));
-        result.closest_m = result.closest_m.min(f64::from(world.gap_m()));
-        let touch = world.touch();
-        if touch.is_some() {
-            // The gap is that at the frame; it touched something since the last one.
-            result.closest_m = result.closest_m.min(0.0);
-        }
+        let (gap_m, touch) = (f64::from(world.gap_m()), world.touch());
+        // A touch can be over at the frame.
+        result.closest_m = result.closest_m.min(if touch.is_some() { gap_m.min(0.0) } else { gap_m });
         if let Some(touch) = touch.filter(|_| !was_touching) {
             result.count(touch, touch.robot.is_some_and(|robot| !views.saw(robot, frame, recent)));
         }
