@@ -168,7 +168,7 @@ fn print_table(scores: &[DriverScores]) -> Result<(), CliError> {
         print_line(line)?;
     }
     if scores.iter().any(|of_driver| !of_driver.intervals_are_reliable) {
-        print_line("the intervals of so few episodes are not to be trusted; drive 10 or more")?;
+        print_line("the intervals of so few episodes are not to be trusted")?;
     }
     Ok(())
 }

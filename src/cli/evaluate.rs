@@ -186,13 +186,13 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<(), CliError> {
         output.write(PAGE, evaluation::html_page(&report, &figures).as_bytes())?;
     }
     output.finish()?;
-    if args.save_scores {
-        save_scores(&report, &model_dir)?;
-    }
     if args.json {
         print_line(as_json(&report, &out))?;
     } else {
         print_summary(&report, &out, args.html)?;
+    }
+    if args.save_scores {
+        save_scores(&report, &model_dir)?;
     }
     args.min_skill.map_or(Ok(()), |least| require_skill(&report, least))
 }

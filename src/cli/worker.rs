@@ -45,8 +45,12 @@ pub(super) fn run(args: &WorkerArgs) -> Result<(), CliError> {
 
 /// `foreframe run-job`: the child process of a server or worker that runs one job.
 pub(super) fn run_job() -> Result<(), CliError> {
-    let format = std::env::var("FOREFRAME_LOG_FORMAT").is_ok_and(|format| format == "json");
-    let _telemetry = telemetry::init(if format { LogFormat::Json } else { LogFormat::Text }, None)?;
+    // The settings of the server come later, with the job.
+    let format = match std::env::var("FOREFRAME_LOG_FORMAT") {
+        Ok(format) if format == "json" => LogFormat::Json,
+        _ => LogFormat::Text,
+    };
+    let _telemetry = telemetry::init(format, None)?;
     child::run().map_err(CliError::Failed)
 }
 

@@ -160,7 +160,7 @@ fn a_baseline_that_knows_few_windows_is_told() {
     let known = report.nearest_windows.unwrap().available;
     let told = verdict(&report);
     let expected = format!(
-        "; the baseline of nearest training windows knows {known} of them, the model 40 469, so the skill may be too high"
+        "; the baseline of nearest training windows knows {known}, and the model was trained on 40 469, so the skill may be too high"
     );
     assert!(told.ends_with(&expected), "{told}");
     assert!(!verdict(&with_windows(10 * known)).contains("too high"));

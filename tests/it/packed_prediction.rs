@@ -132,8 +132,8 @@ fn many_plans_give_the_bits_that_each_alone_gives() {
     let in_fewer_bits = [Precision::Bf16, Precision::Int8]
         .into_iter()
         .filter(|precision| precision.is_supported());
-    let in_fewer_bits =
-        in_fewer_bits.flat_map(|precision| ["moving", "rooms"].map(|name| in_precision(name, precision)));
+    let in_fewer_bits = in_fewer_bits
+        .flat_map(|precision| ["moving", "rooms", "moving-flow", "home"].map(|name| in_precision(name, precision)));
     for network in networks.chain(in_fewer_bits) {
         let spec = network.spec();
         let plans = plans(spec, 21);

@@ -99,13 +99,11 @@ impl SettingsLayer {
         }
     }
 
-    /// One value as text: a TOML value, or else a string, as a name always is: also one of digits only.
+    /// One value as text: a TOML value, or else a string. A name is always a string, also one of digits only.
     #[must_use]
     pub fn text(origin: impl Into<String>, key: &str, text: &str) -> Self {
-        let value = Some(text)
-            .filter(|_| key != "name")
-            .and_then(toml_value)
-            .and_then(|value| Value::serialize(value).ok());
+        let value = toml_value(text).filter(|value| key != "name" || value.is_str());
+        let value = value.and_then(|value| Value::serialize(value).ok());
         Self::value(origin, key, value.unwrap_or_else(|| Value::from(text.trim())))
     }
 

@@ -334,6 +334,8 @@ class SessionFlow:
         except ConnectionFailed as error:
             raise Broken(str(error)) from error
         self._id, self._token = created["id"], created["token"]
+        # Attempts at the session before do not touch this one.
+        self._attempt_until = 0.0
         # Its frame has another number now.
         self._newest_plan = None
         try:

@@ -39,7 +39,7 @@ pub(in crate::server) struct OriginPolicy {
 impl OriginPolicy {
     pub(in crate::server) fn new(config: &ServerConfig, keys: Keys) -> Self {
         Self {
-            // As browsers write them.
+            // Browsers write neither a slash at the end nor capital letters.
             allowed: config
                 .cors_origins
                 .iter()

@@ -59,7 +59,7 @@ impl Precision {
         }
     }
 
-    /// The precision of convolutions and of layers for each place of a grid, and for each ray of a room. They stay in single precision unless one instruction adds up four products of bytes: tiles of
+    /// The precision of convolutions, of the flow network's layers around its decoder and of those for the rays of a room. They stay in single precision unless one instruction adds up four products of bytes: tiles of
     /// places save more than AVX2's bytes.
     pub(super) fn of_convolutions(self) -> Self {
         match self {

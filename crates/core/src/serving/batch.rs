@@ -29,8 +29,8 @@ pub struct BatchChoice {
 }
 
 /// The first live task chooses the model. Later tasks of the same model join in order while the rows stay within its
-/// limit, at most one task of a session. The first task is always included, even if it alone exceeds the limit. The order is that of their
-/// arrival, or all `steps_first`, the steps of sessions, for whose answers robots wait.
+/// limit, at most one task of a session. The first task is always included, even if it alone exceeds the limit. They are taken
+/// in the order of their arrival; if `steps_first`, tasks of a session with one rollout go before the others: robots wait for these.
 #[must_use]
 pub fn choose(waiting: &[Candidate], now: Instant, steps_first: bool) -> BatchChoice {
     let mut choice = BatchChoice::default();

@@ -248,6 +248,23 @@ mod tests {
     }
 
     #[test]
+    fn steps_of_sessions_and_older_requests_take_turns() {
+        let (queue, model) = (Queue::new(8, 1), Arc::new(test_model()));
+        let (mut requests, _answers): (Vec<_>, Vec<_>) = (0..4).map(|_| request(&model)).unzip();
+        for (session, request) in (1..).zip(&mut requests[2..]) {
+            request.session = Some(session);
+        }
+        for request in requests {
+            queue.push(request).unwrap();
+        }
+        let sessions = [(); 4].map(|()| match queue.next_work() {
+            WorkItem::Batch(batch) => batch[0].session,
+            _ => panic!(),
+        });
+        assert_eq!(sessions, [Some(1), None, Some(2), None]);
+    }
+
+    #[test]
     fn windows_of_a_flow_network_are_computed_one_for_each_core() {
         let (queue, model) = (Queue::new(8, 8), Arc::new(test_flow_model()));
         let (requests, _answers): (Vec<_>, Vec<_>) = (0..5).map(|_| request(&model)).unzip();

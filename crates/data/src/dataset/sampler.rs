@@ -121,7 +121,7 @@ impl EpisodeSegment {
 
 /// The episodes and segments of each split. Simulated trials are never divided; their split depends only on split seed and
 /// trial number, so that trials keep their split when a collection grows. Recordings are split by time, in complete episodes
-/// if there are ten or more that allow it.
+/// if there are ten or more and this leaves enough for training.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Splits {
     episodes: [Vec<usize>; Split::ALL.len()],

@@ -14,8 +14,9 @@ use foreframe_core::error_text;
 
 /// How long a job waits for a store before it fails. It can be resumed.
 const LIMIT: Duration = Duration::from_hours(1);
-/// The pause between two tries: twice as long after each, up to the second.
-const PAUSES: [Duration; 2] = [Duration::from_secs(1), Duration::from_secs(30)];
+/// The first pause between two tries. Each later one is twice as long.
+const FIRST_PAUSE: Duration = Duration::from_secs(1);
+const LONGEST_PAUSE: Duration = Duration::from_secs(30);
 /// How often the job is asked during a pause whether it was cancelled.
 const POLL: Duration = Duration::from_millis(50);
 
@@ -48,7 +49,7 @@ impl RetryPolicy<'_> {
 
     /// The same for work that blocks.
     pub(super) fn repeat<T, E: HasErrorKind>(&self, mut work: impl FnMut() -> Result<T, E>) -> Result<T, JobFailure> {
-        let [mut pause, longest] = PAUSES;
+        let mut pause = FIRST_PAUSE;
         // Since when the store is away.
         let mut away_since: Option<Instant> = None;
         loop {
@@ -58,16 +59,15 @@ impl RetryPolicy<'_> {
                 Err(error) => error,
             };
             let reason = error_text::with_causes(&error);
-            // What could work for so long has found the store in between.
-            let is_known = away_since.is_some() && began.elapsed() < LIMIT;
-            let since = *away_since.get_or_insert_with(Instant::now);
-            if error.kind() != ErrorKind::Away || (is_known && since.elapsed() >= LIMIT) {
+            // Work that took so long has found the store in between.
+            away_since.take_if(|_| began.elapsed() >= LIMIT);
+            if error.kind() != ErrorKind::Away || away_since.is_some_and(|since| since.elapsed() >= LIMIT) {
                 return Err(JobFailure::Failed(reason));
             }
-            if !is_known {
+            if away_since.is_none() {
                 warn!(reason, "a job waits for the store");
                 self.report.line(format!("waiting for the store: {reason}"));
-                (away_since, pause) = (Some(Instant::now()), PAUSES[0]);
+                (away_since, pause) = (Some(Instant::now()), FIRST_PAUSE);
             }
             let paused = Instant::now();
             while paused.elapsed() < pause {
@@ -76,7 +76,7 @@ impl RetryPolicy<'_> {
                 }
                 std::thread::sleep(POLL);
             }
-            pause = longest.min(2 * pause);
+            pause = LONGEST_PAUSE.min(2 * pause);
         }
     }
 }

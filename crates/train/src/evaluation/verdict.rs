@@ -6,7 +6,7 @@ use super::report::{EvaluationReport, SetReport, SetScores};
 /// What a reader may do about a model that is not better than simple baselines.
 const ADVICE: &str = "more data or a longer training may help";
 
-/// A baseline that knows less than one window for so many of the model's is not as strong as it could be.
+/// Where a model was trained on so many windows for each one that the baseline knows, the baseline is not as strong as it could be.
 const WINDOWS_FOR_ONE: usize = 10;
 
 impl EvaluationReport {
@@ -28,7 +28,7 @@ impl EvaluationReport {
                 Some("there is no baseline of nearest training windows here, so the skill may be too high".to_owned())
             }
             Some(nearest) if nearest.searched.saturating_mul(WINDOWS_FOR_ONE) < known => Some(format!(
-                "the baseline of nearest training windows knows {} of them, the model {}, so the skill may be too high",
+                "the baseline of nearest training windows knows {}, and the model was trained on {}, so the skill may be too high",
                 grouped(nearest.searched as u64),
                 grouped(known as u64)
             )),

@@ -106,14 +106,7 @@ impl<'a> TrainingPlan<'a> {
                 "weights_sha256": start.manifest.weights_sha256,
             });
         }
-        let mut marks = frame_marks::of_windows(training.dataset, &self.train, config.window_shape().frames())?;
-        // Frames of the model that it started from are no test of this one either.
-        marks.extend(
-            training
-                .start
-                .iter()
-                .flat_map(|start| &start.manifest.dataset.frame_marks),
-        );
+        let frame_marks = self.frame_marks(training)?;
         Ok(Manifest {
             name: config.name.clone(),
             version: 1,
@@ -126,7 +119,7 @@ impl<'a> TrainingPlan<'a> {
                 windows: self.train.len(),
                 split_seed: config.data.split_seed,
                 parts: self.shares(),
-                frame_marks: frame_marks::kept(marks),
+                frame_marks,
             },
             seed: config.seed,
             command: training.command.to_owned(),
@@ -137,6 +130,18 @@ impl<'a> TrainingPlan<'a> {
             multiply_adds_per_frame: self.spec.multiply_adds_per_frame(),
             program: ProgramStamp::current(),
         })
+    }
+
+    /// Marks of the training frames and of those of the model that it started from. None if that one has none: these would not be all.
+    fn frame_marks(&self, training: &Training<'_>) -> Result<Vec<u64>, TrainError> {
+        let of_start = training.start.map(|start| &start.manifest.dataset.frame_marks);
+        if of_start.is_some_and(Vec::is_empty) {
+            return Ok(Vec::new());
+        }
+        let length = training.config.window_shape().frames();
+        let mut marks = frame_marks::of_windows(training.dataset, &self.train, length)?;
+        marks.extend(of_start.into_iter().flatten());
+        Ok(frame_marks::kept(marks))
     }
 
     /// The number of training windows of each part and its share of what is drawn.

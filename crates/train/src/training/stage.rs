@@ -153,7 +153,7 @@ impl StageRunner<'_> {
         let loss = objective.validation_loss(&state.parameters)?;
         if !(0.0..=MAX_LOSS).contains(&loss) {
             return Err(diverged(format!(
-                "the validation loss is {loss:.1}, more than {MAX_LOSS}"
+                "the validation loss is {loss:.1}; it must be {MAX_LOSS} or less"
             )));
         }
         let is_best = progress.best_loss.is_none_or(|best| loss < best);

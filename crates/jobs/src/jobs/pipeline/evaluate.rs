@@ -73,8 +73,16 @@ impl Pipeline {
         // What models are compared by: the score on other data says something about that data.
         let is_own = loaded.manifest.dataset.includes(&dataset.info().content_hash);
         let has_score = loaded.manifest.metrics.get("test").is_some();
+        let is_of_training = found.has_frames_of_training();
+        if is_of_training {
+            report.line(
+                "frames of this data set were in the model's training, so models are not compared by this score"
+                    .to_owned(),
+            );
+        }
+        let counts = (is_own || !has_score) && !is_of_training;
         Ok(JobResult {
-            measured: ((is_own || !has_score) && !found.has_frames_of_training()).then(|| ModelMetrics {
+            measured: counts.then(|| ModelMetrics {
                 model: spec.model.clone(),
                 version,
                 weights_sha256: loaded.manifest.weights_sha256.clone(),

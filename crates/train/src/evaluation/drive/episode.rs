@@ -238,7 +238,9 @@ pub(super) fn drive(
         result.way_m += f64::from(distance(&world, [before.x_m, before.y_m]));
         let (gap_m, touch) = (f64::from(world.gap_m()), world.touch());
         // A touch can be over at the frame.
-        result.closest_m = result.closest_m.min(if touch.is_some() { gap_m.min(0.0) } else { gap_m });
+        result.closest_m = result
+            .closest_m
+            .min(if touch.is_some() { gap_m.min(0.0) } else { gap_m });
         if let Some(touch) = touch.filter(|_| !was_touching) {
             result.count(touch, touch.robot.is_some_and(|robot| !views.saw(robot, frame, recent)));
         }
