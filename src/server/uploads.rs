@@ -132,16 +132,42 @@ impl Uploads {
         })
     }
 
-    /// Deletes the uploads whose import has succeeded, and those that no import has used for too long. Errors: those of the jobs.
-    pub(super) async fn sweep(&self, jobs: &Jobs, objects: &Objects) -> Result<(), JobError> {
+    /// The ids of the uploads of this server.
+    async fn ids(&self) -> Result<Vec<String>, StoreError> {
         let dir = self.dir.clone();
         let found = tokio::task::spawn_blocking(move || names(&dir)).await;
         let found = found.unwrap_or_else(|broken| Err(io::Error::other(broken)));
-        let names = found.map_err(|source| StoreError::Io {
+        found.map_err(|source| StoreError::Io {
             action: "list",
             path: self.dir.clone(),
             source,
-        })?;
+        })
+    }
+
+    /// Deletes an upload. Errors: `NotFound`, `Conflict` while an import that has not ended uses it, those of the jobs.
+    pub(super) async fn delete(&self, id: &str, jobs: &Jobs, objects: &Objects) -> Result<(), ApiError> {
+        let shared = objects.directories(UPLOADS_DIR).await.map_err(JobError::Store)?;
+        let here = self.ids().await.map_err(JobError::Store)?;
+        if !here.iter().chain(&shared).any(|known| known == id) {
+            return Err(ApiError::NotFound(format!("there is no upload {id:?}")));
+        }
+        let _held = jobs.hold_submissions().await;
+        if let Some(job) = jobs.open().await?.iter().find(|job| imports(job, id)) {
+            return Err(ApiError::Conflict(format!(
+                "{} imports it; cancel the job first",
+                job.id
+            )));
+        }
+        objects
+            .delete(&format!("{UPLOADS_DIR}/{id}"))
+            .await
+            .map_err(JobError::Store)?;
+        Ok(())
+    }
+
+    /// Deletes the uploads whose import has succeeded, and those that no import has used for too long. Errors: those of the jobs.
+    pub(super) async fn sweep(&self, jobs: &Jobs, objects: &Objects) -> Result<(), JobError> {
+        let names = self.ids().await?;
         if names.is_empty() {
             return Ok(());
         }
@@ -160,10 +186,8 @@ impl Uploads {
         Ok(())
     }
 
-    fn is_over(&self, name: &str, imports: &[Job]) -> bool {
-        let id = format!(":{name}/");
-        let uses = |job: &&Job| matches!(&job.spec, JobSpec::Import(spec) if spec.source.contains(&id));
-        let newest = imports.iter().find(uses).map(|job| job.state);
+    fn is_over(&self, name: &str, jobs: &[Job]) -> bool {
+        let newest = jobs.iter().find(|job| imports(job, name)).map(|job| job.state);
         let dir = self.dir.join(name);
         let is_older = |limit| age(&dir).is_some_and(|age| age > limit);
         match newest {
@@ -174,6 +198,11 @@ impl Uploads {
             Some(JobState::Failed | JobState::Cancelled) | None => is_older(self.keep),
         }
     }
+}
+
+/// Whether a job imports the upload with this id.
+fn imports(job: &Job, id: &str) -> bool {
+    matches!(&job.spec, JobSpec::Import(spec) if spec.source.contains(&format!(":{id}/")))
 }
 
 /// A file that is being written, and its name when it is whole.

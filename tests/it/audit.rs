@@ -24,7 +24,7 @@ const AUDITED: [&str; 6] = [
     "DELETE /v1/datasets/{dataset}",
 ];
 /// The operations that change nothing that lasts.
-const NOT_AUDITED: [&str; 17] = [
+const NOT_AUDITED: [&str; 18] = [
     "POST /v1/models/{model}/predict",
     "POST /v1/models/{model}/rollouts",
     "POST /v1/models/{model}/plan",
@@ -35,6 +35,7 @@ const NOT_AUDITED: [&str; 17] = [
     "POST /v1/jobs/estimate",
     // Kept only until its import has ended.
     "POST /v1/uploads",
+    "DELETE /v1/uploads/{id}",
     "POST /v1/realtime/sessions",
     "POST /v1/realtime/sessions/{id}/step",
     "POST /v1/realtime/sessions/{id}/reset",

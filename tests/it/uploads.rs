@@ -160,6 +160,37 @@ async fn uploads_are_bounded_in_size_and_number() {
 }
 
 #[tokio::test]
+async fn an_upload_can_be_deleted_unless_a_job_imports_it() {
+    let dir = tempfile::tempdir().unwrap();
+    let config = ServerConfig {
+        run_jobs: false,
+        ..ServerConfig::default()
+    };
+    let app = app(dir.path(), config);
+    let kept = upload(&app, "a.npy", vec![7]).await.json();
+    let dropped = upload(&app, "a.npy", vec![7]).await.json();
+    let job = post(
+        &app,
+        "/v1/jobs",
+        &json!({"kind": "import", "name": "a", "source": kept["source"], "rate": 5}),
+    )
+    .await;
+    assert_eq!(job.status, 202);
+    let delete = async |id: &str| {
+        let request = Request::delete(format!("/v1/uploads/{id}")).body(Body::empty());
+        send(&app, request.unwrap()).await
+    };
+    let detail = delete(kept["id"].as_str().unwrap()).await.detail(409);
+    assert!(detail.contains("job-1 imports it"), "{detail}");
+    let id = dropped["id"].as_str().unwrap();
+    assert_eq!(delete(id).await.status, 204);
+    assert!(!dir.path().join("uploads").join(id).exists());
+    for unknown in [id, "..", "%2e%2e"] {
+        delete(unknown).await.detail(404);
+    }
+}
+
+#[tokio::test]
 async fn an_upload_that_nobody_imports_is_deleted() {
     let dir = tempfile::tempdir().unwrap();
     let config = ServerConfig {

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
-use crate::server::http::extract::Query;
+use crate::server::http::extract::{Path, Query};
 use crate::server::http::problem::{ApiError, unfit};
 use crate::server::state::App;
 use crate::server::token::Token;
@@ -14,7 +14,7 @@ use foreframe_jobs::jobs::JobError;
 use foreframe_jobs::jobs::uploads::UploadedFile;
 
 pub(in crate::server) fn routes() -> OpenApiRouter<App> {
-    OpenApiRouter::new().routes(routes!(create))
+    OpenApiRouter::new().routes(routes!(create)).routes(routes!(delete))
 }
 
 /// The name of the file.
@@ -38,6 +38,8 @@ struct UploadedBytes(Vec<u8>);
 /// An uploaded file.
 #[derive(Debug, Serialize, utoipa::ToSchema)]
 struct Upload {
+    /// Its id, to delete it.
+    id: String,
     /// The `source` of an import job.
     source: String,
     /// Its size in bytes.
@@ -63,7 +65,8 @@ async fn create(
     headers: HeaderMap,
     body: Body,
 ) -> Result<(StatusCode, axum::Json<Upload>), ApiError> {
-    let file = UploadedFile::new(Token::random()?.id(), &query.name).map_err(unfit("name"))?;
+    let id = Token::random()?.id();
+    let file = UploadedFile::new(id.clone(), &query.name).map_err(unfit("name"))?;
     let stated = headers
         .get(header::CONTENT_LENGTH)
         .and_then(|length| length.to_str().ok()?.parse().ok());
@@ -76,5 +79,18 @@ async fn create(
     let bytes = app.uploads.receive(&file, body, &app.blocking).await?;
     file.push(app.store().objects()).await.map_err(JobError::Store)?;
     let source = file.to_string();
-    Ok((StatusCode::CREATED, axum::Json(Upload { source, bytes })))
+    Ok((StatusCode::CREATED, axum::Json(Upload { id, source, bytes })))
+}
+
+/// Deletes an uploaded file that no import needs any more.
+#[utoipa::path(
+    delete, path = "/v1/uploads/{id}",
+    responses(
+        (status = 204, description = "Deleted"),
+        (status = 409, description = "An import that has not ended uses it"),
+    )
+)]
+async fn delete(app: App, Path(id): Path<String>) -> Result<StatusCode, ApiError> {
+    app.uploads.delete(&id, app.jobs(), app.store().objects()).await?;
+    Ok(StatusCode::NO_CONTENT)
 }

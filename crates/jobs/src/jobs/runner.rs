@@ -23,6 +23,8 @@ use foreframe_core::metric_names;
 const WRITE_EVERY: Duration = Duration::from_millis(500);
 /// How often the store is asked for jobs that other processes submitted.
 const POLL_EVERY: Duration = Duration::from_secs(1);
+/// How often it is logged that it cannot be asked.
+const TELL_EVERY: Duration = Duration::from_mins(1);
 /// How often a runner that is asked to stop tries to write a job's outcome.
 const END_ATTEMPTS: u32 = 5;
 
@@ -43,14 +45,21 @@ pub(super) async fn run(shared: Arc<SharedJobs>, instance: Instance, pool: Threa
         warn!(%error, "could not release the leases of an earlier process; its jobs resume when the leases expire");
     }
     let lease_s = shared.limits.lease.as_secs_f64();
+    let mut told: Option<Instant> = None;
     while !shared.is_stopping() {
-        match shared.store.claim(&instance.id, lease_s).await {
+        let claimed = shared.store.claim(&instance.id, lease_s).await;
+        told = told.filter(|_| claimed.is_err());
+        match claimed {
             Ok(Some((row, lease))) => {
                 Box::pin(JobRun::new(&shared, row, lease).run(&pool)).await;
                 continue;
             }
             Ok(None) => {}
-            Err(error) => warn!(%error, "could not claim a job"),
+            Err(error) if told.is_none_or(|told| told.elapsed() >= TELL_EVERY) => {
+                warn!(%error, "could not claim a job");
+                told = Some(Instant::now());
+            }
+            Err(_) => {}
         }
         tokio::select! {
             () = shared.wake.notified() => {}
