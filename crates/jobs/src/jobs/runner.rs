@@ -54,12 +54,11 @@ pub(super) async fn run(shared: Arc<SharedJobs>, instance: Instance, pool: Threa
                 Box::pin(JobRun::new(&shared, row, lease).run(&pool)).await;
                 continue;
             }
-            Ok(None) => {}
             Err(error) if told.is_none_or(|told| told.elapsed() >= TELL_EVERY) => {
                 warn!(%error, "could not claim a job");
                 told = Some(Instant::now());
             }
-            Err(_) => {}
+            Ok(None) | Err(_) => {}
         }
         tokio::select! {
             () = shared.wake.notified() => {}
