@@ -53,11 +53,10 @@ pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
 async fn listen(config: Config, has_default_admin: bool) -> Result<(), CliError> {
     // From the beginning: as the first process of a container, the program would otherwise get no signal before it has started.
     let mut shutdown = Box::pin(server::shutdown::requested());
-    let started = tokio::select! {
+    let (listeners, app) = tokio::select! {
         started = start(config, has_default_admin) => started?,
         () = &mut shutdown => return Ok(()),
     };
-    let (listeners, app) = started;
     let store = app.store().clone();
     server::serve(listeners, app, shutdown).await;
     // From now on the database file alone is complete.

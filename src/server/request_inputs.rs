@@ -8,19 +8,20 @@ use foreframe_core::frame::Frame;
 use foreframe_core::registry::Manifest;
 use foreframe_core::types::{Action, RobotState};
 
-/// Errors: `Unprocessable` if a request asks for more than this server predicts. The model's own horizon is always allowed.
+/// Errors: `Unprocessable` if a request asks for more than this server predicts.
 pub(in crate::server) fn check_steps(
     steps: Option<usize>,
     manifest: &Manifest,
     config: &ServerConfig,
 ) -> Result<(), ApiError> {
-    let limit = config.max_steps.max(manifest.spec.horizon);
-    match steps {
-        Some(found) if !(1..=limit).contains(&found) => Err(ApiError::Unprocessable(format!(
-            "steps is {found}; this server predicts 1 to {limit}"
-        ))),
-        _ => Ok(()),
-    }
+    refused_steps(steps, manifest, config.max_steps).map_or(Ok(()), |reason| Err(ApiError::Unprocessable(reason)))
+}
+
+/// Why so many steps are not predicted, if they are not. The model's own horizon always is.
+pub(in crate::server) fn refused_steps(steps: Option<usize>, manifest: &Manifest, max_steps: usize) -> Option<String> {
+    let limit = max_steps.max(manifest.spec.horizon);
+    let found = steps.filter(|steps| !(1..=limit).contains(steps))?;
+    Some(format!("steps is {found}; this server predicts 1 to {limit}"))
 }
 
 /// The images of `frames` in a request as frames of the model's size.

@@ -198,7 +198,7 @@ class SessionFlow:
         before, self._plans = self._plans, plans
         try:
             try:
-                yield from self._whole(self._configure_plans())
+                yield from self._closing_if_interrupted(self._configure_plans())
             except Broken:
                 # A new stream is told of them when it is opened.
                 self._is_open = False
@@ -240,12 +240,12 @@ class SessionFlow:
             try:
                 if not self._is_open:
                     yield from self._connect()
-                return (yield from self._whole(self._exchange(message)))
+                return (yield from self._closing_if_interrupted(self._exchange(message)))
             except Broken as error:
                 self._is_open = self._is_open and error.retry_after_s > 0
                 pause = yield from self._wait(error, deadline, pause)
 
-    def _whole(self, exchange: Flow[T]) -> Flow[T]:
+    def _closing_if_interrupted(self, exchange: Flow[T]) -> Flow[T]:
         """An exchange. If it is interrupted, the stream is opened again, so that nothing else receives its answer."""
         try:
             return (yield from exchange)

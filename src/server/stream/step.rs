@@ -5,6 +5,7 @@ use std::sync::Arc;
 use super::protocol::{ErrorCode, FrameMessage, OnGap, OnLate, ServerMessage, SessionSettings};
 use crate::server::blocking::TaskError;
 use crate::server::images::{self, ImageError, ImageFormat, ImageInput};
+use crate::server::request_inputs::refused_steps;
 use foreframe_core::error_kind::{ErrorKind, HasErrorKind};
 use foreframe_core::frame::Frame;
 use foreframe_core::frame::resize::Resize;
@@ -70,11 +71,8 @@ impl StepConditions {
         manifest: &Manifest,
         max_steps: usize,
     ) -> Result<ConditioningInput, StepError> {
-        let limit = max_steps.max(manifest.spec.horizon);
-        if let Some(found) = self.steps.filter(|steps| !(1..=limit).contains(steps)) {
-            return Err(StepError::Invalid(format!(
-                "steps is {found}; this server predicts 1 to {limit}"
-            )));
+        if let Some(reason) = refused_steps(self.steps, manifest, max_steps) {
+            return Err(StepError::Invalid(reason));
         }
         let past: Option<Action> = self.action.map(|action| checked("action", action)).transpose()?;
         let actions = |plan: Vec<Vec<f32>>| plan.into_iter().map(|action| checked(names.plan, action)).collect();

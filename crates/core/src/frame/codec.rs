@@ -12,6 +12,8 @@ use super::{Frame, FrameError, FrameSize, MAX_SIDE_PX, jpeg};
 const MAX_METADATA_BYTES: u64 = 1 << 20;
 /// Largest pixel format, in bytes: four channels of 16 bits.
 const MAX_PIXEL_BYTES: u64 = 8;
+/// The least and the most seconds for which a GIF shows a frame. Viewers show shorter ones at speeds of their own.
+const GIF_PERIODS_S: [f64; 2] = [0.02, 10.0];
 
 /// Reads a PNG or JPEG image and converts it to gray. A JPEG image is turned as its EXIF data says. Errors: `Size` if a side is
 /// larger than [`MAX_SIDE_PX`]; `Decode` if the bytes are not PNG or JPEG; `Damaged` for a JPEG image whose data is incomplete or
@@ -46,18 +48,16 @@ pub fn dimensions(bytes: &[u8]) -> Result<FrameSize, FrameError> {
     let reader = reader(bytes, MAX_METADATA_BYTES)?;
     let mut decoder = reader.into_decoder().map_err(FrameError::Decode)?;
     let (width, height) = decoder.dimensions();
-    Ok(match orientation(bytes, &mut decoder)? {
-        Orientation::NoTransforms
-        | Orientation::Rotate180
-        | Orientation::FlipHorizontal
-        | Orientation::FlipVertical => FrameSize { width, height },
-        Orientation::Rotate90 | Orientation::Rotate270 | Orientation::Rotate90FlipH | Orientation::Rotate270FlipH => {
-            FrameSize {
-                width: height,
-                height: width,
-            }
-        }
-    })
+    let is_on_its_side = matches!(
+        orientation(bytes, &mut decoder)?,
+        Orientation::Rotate90 | Orientation::Rotate270 | Orientation::Rotate90FlipH | Orientation::Rotate270FlipH
+    );
+    let (width, height) = if is_on_its_side {
+        (height, width)
+    } else {
+        (width, height)
+    };
+    Ok(FrameSize { width, height })
 }
 
 fn is_jpeg(bytes: &[u8]) -> bool {
@@ -122,9 +122,6 @@ pub fn encode_rgb_png(frame: &Frame) -> Result<Vec<u8>, FrameError> {
         .map_err(FrameError::Encode)?;
     Ok(bytes)
 }
-
-/// How long a GIF shows each frame, in seconds, whatever their period is: viewers show shorter ones at speeds of their own.
-const GIF_PERIODS_S: [f64; 2] = [0.02, 10.0];
 
 /// Encodes the frames as a GIF that repeats forever, with this time between two frames. Errors: `Encode`.
 pub fn encode_gif(frames: &[Frame], period_s: f64) -> Result<Vec<u8>, FrameError> {

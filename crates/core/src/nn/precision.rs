@@ -59,8 +59,8 @@ impl Precision {
         }
     }
 
-    /// The precision of convolutions, of the flow network's layers around its decoder and of those for the rays of a room. They stay in single precision unless one instruction adds up four products of bytes: tiles of
-    /// places save more than AVX2's bytes.
+    /// The precision of convolutions, of the flow network's layers around its decoder and of those for the rays of a room. They stay in
+    /// single precision unless one instruction adds up four products of bytes: tiles of places save more than AVX2's bytes.
     pub(super) fn of_convolutions(self) -> Self {
         match self {
             Self::Int8 if !multiplies_four_bytes() => Self::F32,

@@ -68,7 +68,8 @@ pub struct DatasetStamp {
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub parts: Vec<DatasetShare>,
     /// Marks of a sample of the training frames, also of those of the model that the training started from, in increasing order: the
-    /// 512 smallest of all. A frame's mark is the first 6 bytes of the SHA-256 of its pixels. None in models of earlier programs, and in those that started from one.
+    /// 512 smallest of all. A frame's mark is the first 6 bytes of the SHA-256 of its pixels. None in models of earlier programs, and in
+    /// those whose training started from one.
     #[doc(hidden)]
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub frame_marks: Vec<u64>,

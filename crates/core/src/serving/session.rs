@@ -239,12 +239,14 @@ impl SessionState {
         let spare = (self.features.len() + 1).saturating_sub(spec.context);
         let past_features: Vec<Features> = self.features.iter().skip(spare).cloned().collect();
         let is_full = past_features.len() + 1 == spec.context;
-        // Without the last frame's, those before it would count as those of later frames.
-        let last_state = self.conditioning.state.iter();
-        let past_states = last_state.flat_map(|last| self.past_states.iter().chain([last]));
+        let past_states = match &self.conditioning.state {
+            Some(last) => self.past_states.iter().chain([last]).cloned().collect(),
+            // Without the last frame's state, the others would count as those of the frames after theirs.
+            None => Vec::new(),
+        };
         Task {
             past_features,
-            past_states: last_states(past_states.cloned().collect(), spec),
+            past_states: last_states(past_states, spec),
             camera: self.camera,
             warnings: Vec::new(),
             frames: vec![frame],

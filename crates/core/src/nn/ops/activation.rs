@@ -6,7 +6,7 @@
 use crate::vectorized::Instructions;
 
 /// 1.5 · 2^23: after adding it, the low bits hold the nearest whole number.
-const ROUND: f32 = 12_582_912.0;
+pub(super) const ROUND: f32 = 12_582_912.0;
 
 /// tanh(x) = 2σ(2x) − 1.
 #[inline(always)]

@@ -8,7 +8,7 @@ use rayon::prelude::*;
 
 use super::byte_convolution::{ByteConvolution, ByteKernel};
 use super::image_geometry::{ImageGeometry, TAPS};
-use super::modulation::{activate, activate_roughly};
+use super::modulation::activate;
 use super::packed::{PackedWeights, PlaceInputs, StartSums, TapRun};
 use super::scratch::with_buffers;
 use super::winograd::{PatchWeights, TileSize, TiledConvolution};
@@ -88,27 +88,18 @@ impl Written<'_> {
             Written::Plain => to.copy_from_slice(from),
             Written::Silu => {
                 for (to, &from) in to.iter_mut().zip(from) {
-                    *to = activated::<ROUGHLY>(from, instructions);
+                    *to = activate::<ROUGHLY>(from, instructions);
                 }
             }
             Written::Modulated(modulation) => {
                 let (scale, shift) = modulation.split_at(channels);
                 for (to, from) in to.chunks_exact_mut(channels).zip(from.chunks_exact(channels)) {
                     for (((to, from), scale), shift) in to.iter_mut().zip(from).zip(scale).zip(shift) {
-                        *to = activated::<ROUGHLY>(instructions.multiply_add(*from, 1.0 + scale, *shift), instructions);
+                        *to = activate::<ROUGHLY>(instructions.multiply_add(*from, 1.0 + scale, *shift), instructions);
                     }
                 }
             }
         }
-    }
-}
-
-#[inline(always)]
-fn activated<const ROUGHLY: bool>(x: f32, instructions: Instructions) -> f32 {
-    if ROUGHLY {
-        activate_roughly(x, instructions)
-    } else {
-        activate(x, instructions)
     }
 }
 

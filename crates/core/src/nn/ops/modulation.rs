@@ -84,8 +84,8 @@ impl<'a> PackedPerceptron<'a> {
             let sums = &mut to[..rows * weights.outputs()];
             weights.multiply_alike(&from[..length], sums);
             match next {
-                RowWeights::Single(_) => activate_all(sums),
-                RowWeights::Reduced(_) => activate_all_roughly(sums),
+                RowWeights::Single(_) => activate_all::<false>(sums),
+                RowWeights::Reduced(_) => activate_all::<true>(sums),
             }
             length = sums.len();
             std::mem::swap(&mut from, &mut to);
@@ -93,25 +93,13 @@ impl<'a> PackedPerceptron<'a> {
     }
 }
 
-/// `SiLU` of each value, in place.
-pub(super) fn activate_all(values: &mut [f32]) {
+/// [`activate`] of each value, in place.
+fn activate_all<const ROUGHLY: bool>(values: &mut [f32]) {
     vectorized_by(
         #[inline(always)]
         |instructions| {
             for value in values {
-                *value = activate(*value, instructions);
-            }
-        },
-    );
-}
-
-/// The same, rounded as what is reduced to 16 or 8 bits may be.
-fn activate_all_roughly(values: &mut [f32]) {
-    vectorized_by(
-        #[inline(always)]
-        |instructions| {
-            for value in values {
-                *value = activate_roughly(*value, instructions);
+                *value = activate::<ROUGHLY>(*value, instructions);
             }
         },
     );
@@ -123,15 +111,14 @@ pub(in crate::nn) fn modulated_silu(x: &Tensor, modulation: &Tensor) -> Result<T
     apply(ModulatedSilu, [x, modulation])
 }
 
+/// `SiLU`; roughly: off by less than 4e-5 of x, for what is reduced to 16 or 8 bits.
 #[inline(always)]
-pub(super) fn activate(x: f32, instructions: Instructions) -> f32 {
-    x * sigmoid_with(x, instructions)
-}
-
-/// The same, off by less than 4e-5 of x.
-#[inline(always)]
-pub(super) fn activate_roughly(x: f32, instructions: Instructions) -> f32 {
-    x * rough_sigmoid(x, instructions)
+pub(super) fn activate<const ROUGHLY: bool>(x: f32, instructions: Instructions) -> f32 {
+    if ROUGHLY {
+        x * rough_sigmoid(x, instructions)
+    } else {
+        x * sigmoid_with(x, instructions)
+    }
 }
 
 #[inline(always)]
@@ -152,7 +139,7 @@ impl FusedOperation<1> for Silu {
             #[inline(always)]
             |instructions| {
                 for (value, &x) in values.iter_mut().zip(x.values) {
-                    *value = activate(x, instructions);
+                    *value = activate::<false>(x, instructions);
                 }
             },
         );
@@ -191,7 +178,8 @@ impl FusedOperation<2> for ModulatedSilu {
                     let (scale, shift) = modulation.split_at(channels);
                     for row in values.chunks_exact_mut(channels) {
                         for ((value, scale), shift) in row.iter_mut().zip(scale).zip(shift) {
-                            *value = activate(instructions.multiply_add(*value, 1.0 + scale, *shift), instructions);
+                            *value =
+                                activate::<false>(instructions.multiply_add(*value, 1.0 + scale, *shift), instructions);
                         }
                     }
                 }

@@ -129,7 +129,7 @@ impl ReducedWeights {
         self.multiply_in_ranges(rows, out, 1);
     }
 
-    /// The same, with one range for all rows: its finding takes less time, and values of one kind lose little.
+    /// The same, with one range for all rows. It is found in less time, and rows with values of one kind lose little.
     pub(super) fn multiply_alike(&self, rows: &[f32], out: &mut [f32]) {
         self.multiply_in_ranges(rows, out, usize::MAX);
     }

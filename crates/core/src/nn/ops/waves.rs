@@ -4,14 +4,13 @@
 
 use std::f32::consts::{FRAC_2_PI, FRAC_PI_4};
 
+use super::activation::ROUND;
 use crate::vectorized::Instructions;
 
 /// Sine and cosine of x. Up to ±1000 they differ from the exact values by less than 2e-7; those of larger arguments
 /// are inaccurate, but within −1 to 1. Those of NaN and infinities are NaN.
 #[inline(always)]
 pub(in crate::nn) fn sin_cos(x: f32, instructions: Instructions) -> (f32, f32) {
-    /// 1.5 · 2^23: after adding it, the low bits hold the nearest whole number.
-    const ROUND: f32 = 12_582_912.0;
     let shifted = instructions.multiply_add(x, FRAC_2_PI, ROUND);
     let (turns, quarter) = (shifted - ROUND, shifted.to_bits());
     // A quarter turn in three parts, of which the first two have few digits, so that their multiples are exact.

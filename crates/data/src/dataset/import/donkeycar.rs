@@ -128,12 +128,9 @@ pub(super) fn open(tub: &Path, options: &ImportOptions) -> Result<Recording, Imp
                 Ok((index, _, _)) if !options.include_deleted && manifest.deleted.contains(&index) => {
                     (marked, left_out) = (marked + 1, true);
                 }
-                Ok((_, image, record)) => {
-                    let begins_episode = std::mem::take(&mut left_out);
-                    records.push(Record {
-                        begins_episode,
-                        ..record
-                    });
+                Ok((_, image, mut record)) => {
+                    record.begins_episode = std::mem::take(&mut left_out);
+                    records.push(record);
                     paths.push(image);
                 }
                 Err(error) => {

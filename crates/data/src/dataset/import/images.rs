@@ -105,12 +105,9 @@ fn with_csv(folder: &Path, csv: &Path, options: &ImportOptions) -> Result<Record
                 Ok((inside(folder, name, &place)?, record))
             });
         match parsed {
-            Ok((path, record)) => {
-                let begins_episode = std::mem::take(&mut left_out);
-                records.push(Record {
-                    begins_episode,
-                    ..record
-                });
+            Ok((path, mut record)) => {
+                record.begins_episode = std::mem::take(&mut left_out);
+                records.push(record);
                 paths.push(path);
             }
             Err(error) => {

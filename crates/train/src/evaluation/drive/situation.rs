@@ -83,8 +83,13 @@ impl Situation<'_> {
             .take(self.states.len().saturating_sub(1))
             .cloned()
             .collect();
-        let task = Task::rollout(frames, past, Some(self.camera), Vec::new(), &model.manifest)?;
-        Ok(task)
+        Ok(Task::rollout(
+            frames,
+            past,
+            Some(self.camera),
+            Vec::new(),
+            &model.manifest,
+        )?)
     }
 
     /// What the model sees around the robot, and where it expects movers.
