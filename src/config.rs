@@ -166,6 +166,7 @@ impl LoadedConfig {
         if let Some(port) = config.port {
             config.bind.set_port(port);
         }
+        server.job_log_format = config.log_format;
         config.server = server;
         Ok(Self { config, values })
     }
@@ -249,8 +250,20 @@ pub fn environment_layers(variables: impl Iterator<Item = (String, String)>) -> 
     variables.filter_map(|(name, text)| {
         let field = name.strip_prefix(PREFIX)?.to_ascii_lowercase();
         let is_setting = !name.starts_with(TEST_PREFIX);
-        is_setting.then(|| SettingsLayer::text(format!("environment {name}"), &field, &text))
+        let origin = if is_service_link(&field, &text) {
+            format!("environment {name}, which Kubernetes sets for a Service; set enableServiceLinks: false in the pod")
+        } else {
+            format!("environment {name}")
+        };
+        is_setting.then(|| SettingsLayer::text(origin, &field, &text))
     })
+}
+
+/// Whether Kubernetes made the variable for a Service of our name: `…_SERVICE_HOST`, `…_PORT_80_TCP_ADDR` and the like.
+fn is_service_link(field: &str, text: &str) -> bool {
+    let is_address = field.ends_with("port") && (text.starts_with("tcp://") || text.starts_with("udp://"));
+    let parts = ["service_host", "service_port", "_tcp", "_udp"];
+    is_address || parts.iter().any(|part| field.contains(part))
 }
 
 /// What a setting must be, where its type does not say it well.
@@ -261,7 +274,7 @@ fn expected(field: &str) -> Option<String> {
         "device" => "cpu, cuda or cuda:N",
         "precision" => "f32, bf16 or int8",
         "port" => "0 to 65535",
-        _ => return range(field),
+        _ => return whole_number(field),
     };
     Some(what.to_owned())
 }
@@ -271,4 +284,19 @@ fn range(field: &str) -> Option<String> {
     let bounds = ServerConfig::default().bounds();
     let (_, _, range) = bounds.iter().find(|(name, _, _)| *name == field)?;
     Some(format!("{} to {}", range.start(), range.end()))
+}
+
+/// What a setting with a range must be: a whole number of the unit that its name ends with.
+fn whole_number(field: &str) -> Option<String> {
+    let units = [
+        ("_bytes", " of bytes"),
+        ("_mib", " of MiB"),
+        ("_ms", " of milliseconds"),
+        ("_s", " of seconds"),
+    ];
+    let of_unit = units
+        .iter()
+        .find(|(end, _)| field.ends_with(end))
+        .map_or("", |(_, unit)| unit);
+    range(field).map(|range| format!("a whole number{of_unit}, {range}"))
 }

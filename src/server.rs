@@ -2,7 +2,7 @@
 //! handlers share, [`protocol`] the messages of a stream.
 //!
 //! The rooms in the order in which they may use each other; each uses only those before it:
-//! `config`, `msgpack`, `http` (connections, limits, keys, problem details), `blocking`, `render_cache`, `images`, `request_inputs`, `plans`, `stream` (a session and its
+//! `config`, `msgpack`, `http` (connections, limits, keys, problem details), `blocking`, `render_cache`, `shared_reading`, `images`, `request_inputs`, `plans`, `stream` (a session and its
 //! WebSocket), `environments`, `uploads`, `inference_statistics`, `state` ([`App`]), `routes` (one resource a file), `openapi`, `router`, `admin` (health checks and metrics on their own
 //! address), `serve`.
 
@@ -24,6 +24,7 @@ mod request_inputs;
 mod router;
 mod routes;
 mod serve;
+mod shared_reading;
 mod state;
 mod stream;
 mod token;

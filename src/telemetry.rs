@@ -23,6 +23,17 @@ pub enum LogFormat {
     Json,
 }
 
+impl LogFormat {
+    /// As in the setting `log_format`.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Text => "text",
+            Self::Json => "json",
+        }
+    }
+}
+
 /// Why traces cannot be sent.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]

@@ -3,6 +3,7 @@
 
 use std::collections::VecDeque;
 use std::sync::Arc;
+use std::time::Duration;
 
 use super::BridgeError;
 use foreframe_core::frame::resize::{Resize, resize};
@@ -40,7 +41,11 @@ pub(super) struct LivePrediction {
     model: Arc<Model>,
     session: Session,
     action: Option<Action>,
-    state: Option<RobotState>,
+    state: Option<TimedState>,
+    /// How far the times of a state and an image may be apart.
+    state_age_limit: Duration,
+    /// Whether the last state was too old for the last image.
+    has_old_state: bool,
     /// The time of the last frame, and when the next one is due.
     last_ns: Option<u64>,
     due_ns: u64,
@@ -48,13 +53,20 @@ pub(super) struct LivePrediction {
     expected: VecDeque<Option<Frame>>,
 }
 
+struct TimedState {
+    state: RobotState,
+    time_ns: u64,
+}
+
 impl LivePrediction {
-    pub(super) fn new(model: Arc<Model>) -> Self {
+    pub(super) fn new(model: Arc<Model>, state_age_limit: Duration) -> Self {
         Self {
             session: Session::new(Arc::clone(&model)),
             model,
             action: None,
             state: None,
+            state_age_limit,
+            has_old_state: false,
             last_ns: None,
             due_ns: 0,
             expected: VecDeque::new(),
@@ -65,18 +77,24 @@ impl LivePrediction {
         self.action = Some(action);
     }
 
-    pub(super) fn set_state(&mut self, state: RobotState) {
-        self.state = Some(state);
+    pub(super) fn set_state(&mut self, state: RobotState, time_ns: u64) {
+        self.state = Some(TimedState { state, time_ns });
     }
 
-    /// Predicts from an image; `None` if it comes between two frames of the model, or before the first action and state that the
-    /// model needs. Errors: `Frame`, `Serving`.
+    /// Whether the last state was too old for the last image, and so was not used.
+    pub(super) fn has_old_state(&self) -> bool {
+        self.has_old_state
+    }
+
+    /// Predicts from an image; `None` if it comes between two frames of the model, or the model needs an action or a state and there is
+    /// none, or only a state that is too old. Errors: `Frame`, `Serving`.
     pub(super) fn step(&mut self, image: &Frame, time_ns: u64) -> Result<Option<LiveStep>, BridgeError> {
         let model = Arc::clone(&self.model);
         let spec = model.spec();
+        let state = self.current_state(time_ns);
         let lacks = |is_taken: bool, is_known: bool| is_taken && !is_known && !spec.sees_speeds();
         if lacks(spec.action_inputs().is_some(), self.action.is_some())
-            || lacks(spec.state_inputs().is_some(), self.state.is_some())
+            || lacks(spec.state_inputs().is_some(), state.is_some())
         {
             return Ok(None);
         }
@@ -87,7 +105,7 @@ impl LivePrediction {
         let (width, height, horizon) = (spec.frame_width_px, spec.frame_height_px, spec.horizon);
         let frame = resize(image, width, height, Resize::Crop)?;
         let plan = self.action.as_ref().map(|action| vec![action.clone(); horizon]);
-        let rollout = self.session.step(frame.clone(), self.state.as_ref(), plan.as_deref())?;
+        let rollout = self.session.step(frame.clone(), state.as_ref(), plan.as_deref())?;
         let error = self.expected.pop_front().flatten().map(|expected| {
             let levels = |frame: &Frame| {
                 frame
@@ -107,6 +125,15 @@ impl LivePrediction {
             error,
             expected_error: rollout.and_then(|rollout| Some(f64::from(rollout.expected_mse().last().copied()?))),
         }))
+    }
+
+    /// The last state, if it counts as the present one at this time: if the clock goes back, one from before does not.
+    fn current_state(&mut self, time_ns: u64) -> Option<RobotState> {
+        let limit = self.state_age_limit;
+        let is_old = |state: &TimedState| Duration::from_nanos(state.time_ns.abs_diff(time_ns)) > limit;
+        self.has_old_state = self.state.as_ref().is_some_and(is_old);
+        let current = self.state.as_ref().filter(|_| !self.has_old_state);
+        current.map(|timed| timed.state.clone())
     }
 
     /// Whether an image of this time is the next frame. Begins anew after a gap, or if time goes back.

@@ -10,6 +10,8 @@ pub(super) const SUBPROTOCOLS: &str = "foxglove.sdk.v1, foxglove.websocket.v1";
 
 /// The first byte of a binary message with data, in both directions.
 const MESSAGE_DATA: u8 = 1;
+/// So much of a robot's text is repeated in a message.
+const MAX_QUOTED_CHARS: usize = 100;
 
 /// What a robot says in text.
 #[derive(Debug, Deserialize)]
@@ -22,7 +24,8 @@ pub(super) enum RobotMessage {
         capabilities: Vec<String>,
     },
     Advertise {
-        channels: Vec<RobotChannel>,
+        /// To be read one by one: see [`RobotChannel::read`].
+        channels: Vec<Value>,
     },
     Unadvertise {
         channel_ids: Vec<u64>,
@@ -42,6 +45,19 @@ pub(super) struct RobotChannel {
     pub(super) schema_name: String,
 }
 
+impl RobotChannel {
+    /// Errors: which channel it is, and why it cannot be read.
+    pub(super) fn read(channel: &Value) -> Result<Self, String> {
+        Self::deserialize(channel).map_err(|error| {
+            let name = channel["topic"].as_str().map_or_else(
+                || "without a topic".to_owned(),
+                |topic| topic.chars().take(MAX_QUOTED_CHARS).collect(),
+            );
+            format!("{name}: {error}")
+        })
+    }
+}
+
 /// What the bridge publishes. The number is that of its channel.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum PublishedTopic {
@@ -50,17 +66,49 @@ pub(super) enum PublishedTopic {
     ExpectedError = 3,
 }
 
-/// The request to publish, below a prefix as `/foreframe`.
-pub(super) fn advertise(prefix: &str) -> Value {
-    let channel = |topic: PublishedTopic, name: &str, schema: &str| json!({"id": topic as u32, "topic": format!("{prefix}/{name}"), "encoding": "cdr", "schemaName": schema});
-    json!({"op": "advertise", "channels": [
-        channel(PublishedTopic::Predicted, "predicted", "sensor_msgs/msg/CompressedImage"),
-        channel(PublishedTopic::Error, "error", "std_msgs/msg/Float64"),
-        channel(PublishedTopic::ExpectedError, "expected_error", "std_msgs/msg/Float64"),
-    ]})
+impl PublishedTopic {
+    const ALL: [Self; 3] = [Self::Predicted, Self::Error, Self::ExpectedError];
+
+    /// The last part of its name.
+    fn name(self) -> &'static str {
+        match self {
+            Self::Predicted => "predicted",
+            Self::Error => "error",
+            Self::ExpectedError => "expected_error",
+        }
+    }
+
+    fn schema_name(self) -> &'static str {
+        match self {
+            Self::Predicted => "sensor_msgs/msg/CompressedImage",
+            Self::Error | Self::ExpectedError => "std_msgs/msg/Float64",
+        }
+    }
 }
 
-const ROLES: [LiveRole; 3] = [LiveRole::Image, LiveRole::Command, LiveRole::Measurement];
+/// The request to publish, below a prefix as `/foreframe`.
+pub(super) fn advertise(prefix: &str) -> Value {
+    let channels = PublishedTopic::ALL.map(|topic| {
+        let name = format!("{prefix}/{}", topic.name());
+        json!({"id": topic as u32, "topic": name, "encoding": "cdr", "schemaName": topic.schema_name()})
+    });
+    json!({"op": "advertise", "channels": channels})
+}
+
+/// Whether a bridge with this prefix publishes this topic. ROS 2 adds a slash before a name without one.
+pub(super) fn is_published(prefix: &str, topic: &str) -> bool {
+    let bare = |name: &str| name.trim_start_matches('/').to_owned();
+    PublishedTopic::ALL
+        .into_iter()
+        .any(|published| bare(&format!("{prefix}/{}", published.name())) == bare(topic))
+}
+
+/// Whether the name of a topic with images is as another bridge names its predictions.
+pub(super) fn is_prediction(topic: &str) -> bool {
+    topic.rsplit('/').next() == Some(PublishedTopic::Predicted.name())
+}
+
+pub(super) const ROLES: [LiveRole; 3] = [LiveRole::Image, LiveRole::Command, LiveRole::Measurement];
 
 /// The request for the messages of a channel. A subscription has the number of its role.
 pub(super) fn subscribe(role: LiveRole, channel: u64) -> Value {
@@ -111,10 +159,12 @@ mod tests {
         let RobotMessage::Advertise { channels } = serde_json::from_str(text).unwrap() else {
             panic!()
         };
-        assert_eq!(
-            (channels[0].id, &*channels[0].schema_name),
-            (3, "nav_msgs/msg/Odometry")
-        );
+        let channel = RobotChannel::read(&channels[0]).unwrap();
+        assert_eq!((channel.id, &*channel.schema_name), (3, "nav_msgs/msg/Odometry"));
+        let wrong = json!({"id": 1, "topic": "/x", "encoding": "json", "schemaName": null});
+        let error = RobotChannel::read(&wrong).unwrap_err();
+        assert!(error.contains("/x: invalid type: null"), "{error}");
+        assert!(RobotChannel::read(&json!(5)).unwrap_err().contains("without a topic"));
         let text = r#"{"op":"unadvertise","channelIds":[3]}"#;
         assert!(
             matches!(serde_json::from_str(text).unwrap(), RobotMessage::Unadvertise { channel_ids } if channel_ids == [3])
@@ -123,6 +173,26 @@ mod tests {
             serde_json::from_str(r#"{"op":"status","level":1}"#).unwrap(),
             RobotMessage::Other
         ));
+    }
+
+    #[test]
+    fn a_bridge_knows_its_topics_and_those_of_others() {
+        for (prefix, topic) in [
+            ("/foreframe", "/foreframe/predicted"),
+            ("foreframe", "/foreframe/expected_error"),
+            ("", "/error"),
+        ] {
+            assert!(is_published(prefix, topic), "{prefix} {topic}");
+        }
+        for (prefix, topic) in [
+            ("/camera", "/camera/image_raw"),
+            ("", "/image"),
+            ("/rooms", "/moving/predicted"),
+            ("/rooms", "/roomspredicted"),
+        ] {
+            assert!(!is_published(prefix, topic), "{prefix} {topic}");
+        }
+        assert!(is_prediction("/moving/predicted") && !is_prediction("/predicted/image"));
     }
 
     #[test]

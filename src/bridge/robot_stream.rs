@@ -8,6 +8,7 @@ use std::convert::Infallible;
 use std::io::{self, Read, Write};
 use std::net::TcpStream;
 use std::path::Path;
+use std::time::Instant;
 
 use super::BridgeError;
 
@@ -37,7 +38,7 @@ impl RobotTls {
     #[cfg(feature = "tls")]
     pub(super) fn handshake(self, host: String, stream: TcpStream) -> Result<RobotStream, String> {
         let secure = self.0.handshake(host, stream)?;
-        Ok(RobotStream::Tls(Box::new(secure)))
+        Ok(RobotStream::new(RobotBytes::Tls(Box::new(secure))))
     }
 
     /// Never called.
@@ -47,48 +48,69 @@ impl RobotTls {
     }
 }
 
-/// A connection to a robot.
-pub(super) enum RobotStream {
+/// A connection to a robot. Knows when bytes came last.
+pub(super) struct RobotStream {
+    bytes: RobotBytes,
+    heard_at: Instant,
+}
+
+enum RobotBytes {
     Plain(TcpStream),
     #[cfg(feature = "tls")]
     Tls(Box<tls::TlsStream>),
 }
 
 impl RobotStream {
+    pub(super) fn plain(stream: TcpStream) -> Self {
+        Self::new(RobotBytes::Plain(stream))
+    }
+
+    fn new(bytes: RobotBytes) -> Self {
+        let heard_at = Instant::now();
+        Self { bytes, heard_at }
+    }
+
+    /// When the last bytes came; at first, when it was opened.
+    pub(super) fn heard_at(&self) -> Instant {
+        self.heard_at
+    }
+
     /// The connection below.
     pub(super) fn tcp(&self) -> &TcpStream {
-        match self {
-            Self::Plain(stream) => stream,
+        match &self.bytes {
+            RobotBytes::Plain(stream) => stream,
             #[cfg(feature = "tls")]
-            Self::Tls(stream) => stream.get_ref(),
+            RobotBytes::Tls(stream) => stream.get_ref(),
         }
     }
 }
 
 impl Read for RobotStream {
     fn read(&mut self, bytes: &mut [u8]) -> io::Result<usize> {
-        match self {
-            Self::Plain(stream) => stream.read(bytes),
+        let count = match &mut self.bytes {
+            RobotBytes::Plain(stream) => stream.read(bytes),
             #[cfg(feature = "tls")]
-            Self::Tls(stream) => stream.read(bytes),
-        }
+            RobotBytes::Tls(stream) => stream.read(bytes),
+        }?;
+        self.heard_at = Instant::now();
+        Ok(count)
     }
 }
 
 impl Write for RobotStream {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
-        match self {
-            Self::Plain(stream) => stream.write(bytes),
+        match &mut self.bytes {
+            RobotBytes::Plain(stream) => stream.write(bytes),
             #[cfg(feature = "tls")]
-            Self::Tls(stream) => stream.write(bytes),
+            RobotBytes::Tls(stream) => stream.write(bytes),
         }
     }
 
     fn flush(&mut self) -> io::Result<()> {
-        match self {
-            Self::Plain(stream) => stream.flush(),
+        match &mut self.bytes {
+            RobotBytes::Plain(stream) => stream.flush(),
             #[cfg(feature = "tls")]
-            Self::Tls(stream) => stream.flush(),
+            RobotBytes::Tls(stream) => stream.flush(),
         }
     }
 }

@@ -1,13 +1,19 @@
 //! Which topics of a robot are subscribed, and how their messages become what a model takes.
 
 use std::collections::BTreeMap;
+use std::time::{Duration, Instant};
 
 use super::BridgeError;
 use super::live_prediction::Seen;
-use super::protocol::RobotChannel;
+use super::protocol::{self, RobotChannel};
 use foreframe_core::nn::{ChannelScale, ModelSpec};
 use foreframe_core::types::{Action, RobotState};
 use foreframe_data::dataset::import::live::{LiveRole, LiveType, LiveValue};
+
+const IMAGE_TYPES: &str =
+    "sensor_msgs/msg/Image or CompressedImage in cdr, or foxglove.RawImage or CompressedImage in protobuf or json";
+const ACTION_TYPES: &str = "geometry_msgs/msg/Twist or TwistStamped in cdr or json";
+const STATE_TYPES: &str = "nav_msgs/msg/Odometry or sensor_msgs/msg/JointState in cdr or json";
 
 /// The topics as their user names them; without a name, the first of the right type.
 #[derive(Clone, Debug, Default)]
@@ -22,6 +28,53 @@ pub(crate) struct TopicNames {
     pub(crate) prefix: String,
 }
 
+impl TopicNames {
+    /// Errors: `Topic` if one of them is published by the bridge itself.
+    pub(super) fn check(&self) -> Result<(), BridgeError> {
+        for role in protocol::ROLES {
+            let own = self
+                .named(role)
+                .filter(|topic| protocol::is_published(&self.prefix, topic));
+            if let Some(topic) = own {
+                return Err(BridgeError::Topic(format!(
+                    "--{} names {topic}, which this bridge itself publishes; name a topic of the robot, or another --prefix",
+                    word(role)
+                )));
+            }
+        }
+        Ok(())
+    }
+
+    fn named(&self, role: LiveRole) -> Option<&str> {
+        match role {
+            LiveRole::Image => self.image.as_deref(),
+            LiveRole::Command => self.action.as_deref(),
+            LiveRole::Measurement => self.state.as_deref(),
+        }
+    }
+}
+
+/// What a topic is subscribed for, as the options call it.
+pub(crate) fn word(role: LiveRole) -> &'static str {
+    match role {
+        LiveRole::Image => "image",
+        LiveRole::Command => "action",
+        LiveRole::Measurement => "state",
+    }
+}
+
+/// What becomes of a channel.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum ChannelUse {
+    /// It is to be subscribed for this.
+    Subscribed(LiveRole),
+    /// It could be used for this, but another one was chosen, by its type alone.
+    Alternative(LiveRole),
+    /// By its name, it has what another bridge predicted.
+    Prediction,
+    Unused,
+}
+
 /// The subscribed topics.
 pub(super) struct Topics<'a> {
     names: &'a TopicNames,
@@ -33,6 +86,8 @@ struct ChosenChannel {
     id: u64,
     topic: String,
     kind: LiveType,
+    /// When the last message came that could be read.
+    read_at: Option<Instant>,
 }
 
 impl<'a> Topics<'a> {
@@ -44,32 +99,42 @@ impl<'a> Topics<'a> {
         }
     }
 
-    /// What a channel is to be subscribed for; `None` if it is not needed. Errors: `Topic` if it was named for what its messages cannot
-    /// be.
-    pub(super) fn choose(&mut self, channel: &RobotChannel) -> Result<Option<LiveRole>, BridgeError> {
+    /// What a channel is used for. Errors: `Topic` if it was named for what its messages cannot be.
+    pub(super) fn choose(&mut self, channel: &RobotChannel) -> Result<ChannelUse, BridgeError> {
+        let RobotChannel { id, topic, .. } = channel;
         let kind = LiveType::of(&channel.encoding, &channel.schema_name);
-        let Some(role) = self.role(channel, kind)? else {
-            return Ok(None);
+        let role = self.role(channel, kind)?.filter(|role| self.is_taken(*role));
+        let Some((role, kind)) = role.zip(kind) else {
+            return Ok(ChannelUse::Unused);
         };
-        let Some(kind) = kind.filter(|_| self.is_needed(role) && !self.chosen.contains_key(&role)) else {
-            return Ok(None);
+        let is_named = self.names.named(role).is_some();
+        if !is_named && protocol::is_published(&self.names.prefix, topic) {
+            return Ok(ChannelUse::Unused);
+        }
+        if !is_named && kind.is_image() && protocol::is_prediction(topic) {
+            return Ok(ChannelUse::Prediction);
+        }
+        if let Some(chosen) = self.chosen.get(&role) {
+            let is_other = !is_named && chosen.topic != *topic;
+            return Ok(if is_other {
+                ChannelUse::Alternative(role)
+            } else {
+                ChannelUse::Unused
+            });
+        }
+        let chosen = ChosenChannel {
+            id: *id,
+            topic: topic.clone(),
+            kind,
+            read_at: None,
         };
-        let (id, topic) = (channel.id, channel.topic.clone());
-        self.chosen.insert(role, ChosenChannel { id, topic, kind });
-        Ok(Some(role))
+        self.chosen.insert(role, chosen);
+        Ok(ChannelUse::Subscribed(role))
     }
 
     fn role(&self, channel: &RobotChannel, kind: Option<LiveType>) -> Result<Option<LiveRole>, BridgeError> {
-        let TopicNames {
-            image, action, state, ..
-        } = self.names;
-        let own = kind.and_then(LiveType::role);
-        for (name, role) in [
-            (image, LiveRole::Image),
-            (action, LiveRole::Command),
-            (state, LiveRole::Measurement),
-        ] {
-            if name.as_ref() != Some(&channel.topic) {
+        for role in protocol::ROLES {
+            if self.names.named(role) != Some(channel.topic.as_str()) {
                 continue;
             }
             // A command can be measured, and a measurement a command; an image is only an image.
@@ -84,25 +149,64 @@ impl<'a> Topics<'a> {
             } = channel;
             return Err(BridgeError::Topic(format!(
                 "the topic {topic} has messages of the type {schema_name:?} in {encoding:?}, which cannot be used for it; images are \
-                 sensor_msgs/msg/Image or CompressedImage in cdr, or foxglove.RawImage or CompressedImage in protobuf or json; commands and \
-                 states are geometry_msgs/msg/Twist or TwistStamped, nav_msgs/msg/Odometry or sensor_msgs/msg/JointState in cdr or json, or \
-                 any other object with numbers in json"
+                 {IMAGE_TYPES}; actions and states are {ACTION_TYPES}, {STATE_TYPES}, or any other object with numbers in json"
             )));
         }
-        let named = |role| match role {
-            LiveRole::Image => image,
-            LiveRole::Command => action,
-            LiveRole::Measurement => state,
-        };
-        Ok(own.filter(|own| named(*own).is_none()))
+        let own = kind.and_then(LiveType::role);
+        Ok(own.filter(|own| self.names.named(*own).is_none()))
     }
 
-    fn is_needed(&self, role: LiveRole) -> bool {
+    /// Whether the model takes it.
+    fn is_taken(&self, role: LiveRole) -> bool {
         match role {
             LiveRole::Image => true,
             LiveRole::Command => self.spec.action_inputs().is_some(),
             LiveRole::Measurement => self.spec.state_inputs().is_some(),
         }
+    }
+
+    /// The topic that is subscribed for this.
+    pub(super) fn topic(&self, role: LiveRole) -> Option<&str> {
+        self.chosen.get(&role).map(|chosen| chosen.topic.as_str())
+    }
+
+    /// What a prediction needs and does not have, in a sentence each: topics that the robot does not have, topics without messages, and
+    /// a camera without images for this long.
+    pub(super) fn missing(&self, without_images: Duration) -> Vec<String> {
+        let needed = |role: &LiveRole| {
+            let can_do_without = *role != LiveRole::Image && self.spec.sees_speeds();
+            self.is_taken(*role) && !can_do_without
+        };
+        let missing = |role| {
+            let word = word(role);
+            let Some(ChosenChannel { topic, read_at, .. }) = self.chosen.get(&role) else {
+                if let Some(topic) = self.names.named(role) {
+                    return Some(format!("the robot has no topic {topic}, named by --{word}"));
+                }
+                return Some(match role {
+                    LiveRole::Image => format!("the robot has no topic for the image ({IMAGE_TYPES})"),
+                    LiveRole::Command => {
+                        format!(
+                            "the robot has no topic for the action ({ACTION_TYPES}; others in json are named by --action)"
+                        )
+                    }
+                    LiveRole::Measurement => {
+                        format!(
+                            "the robot has no topic for the state ({STATE_TYPES}; others in json are named by --state)"
+                        )
+                    }
+                });
+            };
+            match read_at {
+                None => Some(format!("no message of {topic} ({word}) came that can be read")),
+                // An action is held, and an old state is noticed by its time.
+                Some(at) if role == LiveRole::Image && at.elapsed() >= without_images => {
+                    Some(format!("{topic} has no new images that can be read"))
+                }
+                Some(_) => None,
+            }
+        };
+        protocol::ROLES.into_iter().filter(needed).filter_map(missing).collect()
     }
 
     /// These channels are gone; others can take their place.
@@ -111,22 +215,31 @@ impl<'a> Topics<'a> {
     }
 
     /// What a message holds; `None` for a channel that is gone. Errors: `Message`, `Topic`.
-    pub(super) fn read(&self, role: LiveRole, payload: &[u8]) -> Result<Option<Seen>, BridgeError> {
-        let Some(ChosenChannel { topic, kind, .. }) = self.chosen.get(&role) else {
+    pub(super) fn read(&mut self, role: LiveRole, payload: &[u8]) -> Result<Option<Seen>, BridgeError> {
+        let Some(chosen) = self.chosen.get_mut(&role) else {
             return Ok(None);
         };
+        let seen = chosen.read(role, self.spec, payload)?;
+        chosen.read_at = Some(Instant::now());
+        Ok(Some(seen))
+    }
+}
+
+impl ChosenChannel {
+    fn read(&self, role: LiveRole, spec: &ModelSpec, payload: &[u8]) -> Result<Seen, BridgeError> {
+        let Self { topic, kind, .. } = self;
         let wrong = |reason: String| BridgeError::Message {
             topic: topic.clone(),
             reason,
         };
         if role == LiveRole::Image {
-            return kind.image(payload).map(Seen::Image).map(Some).map_err(wrong);
+            return kind.image(payload).map(Seen::Image).map_err(wrong);
         }
         let values = kind.values(payload).map_err(wrong)?;
         let channels = if role == LiveRole::Command {
-            &self.spec.actions
+            &spec.actions
         } else {
-            &self.spec.states
+            &spec.states
         };
         let numbers = channels.iter().map(|channel| number(&values, channel));
         let numbers = numbers.collect::<Result<Vec<f32>, String>>();
@@ -135,7 +248,7 @@ impl<'a> Topics<'a> {
             LiveRole::Command => Action::try_from(numbers).map(Seen::Action),
             _ => RobotState::try_from(numbers).map(Seen::State),
         };
-        seen.map(Some).map_err(|error| wrong(error.to_string()))
+        seen.map_err(|error| wrong(error.to_string()))
     }
 }
 
@@ -188,13 +301,19 @@ mod tests {
             channel(2, "/rear", "sensor_msgs/msg/Image"),
         );
         let mut topics = Topics::new(&any, &spec);
-        assert_eq!(topics.choose(&front).unwrap(), Some(LiveRole::Image));
-        assert_eq!(topics.choose(&rear).unwrap(), None);
+        let image = ChannelUse::Subscribed(LiveRole::Image);
+        assert_eq!(topics.choose(&front).unwrap(), image);
+        assert_eq!(topics.choose(&rear).unwrap(), ChannelUse::Alternative(LiveRole::Image));
         topics.forget(&[1]);
-        assert_eq!(topics.choose(&rear).unwrap(), Some(LiveRole::Image));
+        assert_eq!(topics.choose(&rear).unwrap(), image);
         let mut topics = Topics::new(&named, &spec);
-        assert_eq!(topics.choose(&front).unwrap(), None);
-        assert_eq!(topics.choose(&rear).unwrap(), Some(LiveRole::Image));
+        assert_eq!(topics.choose(&front).unwrap(), ChannelUse::Unused);
+        assert_eq!(topics.choose(&rear).unwrap(), image);
+        assert_eq!(
+            topics.choose(&rear).unwrap(),
+            ChannelUse::Unused,
+            "the same topic again"
+        );
         let wrong = channel(3, "/rear", "nav_msgs/msg/Odometry");
         assert!(
             topics
@@ -203,6 +322,27 @@ mod tests {
                 .to_string()
                 .contains("cannot be used for it")
         );
+    }
+
+    #[test]
+    fn what_a_bridge_publishes_is_a_camera_only_if_named() {
+        let spec = ModelSpec::default();
+        let names = |image: Option<&str>| TopicNames {
+            image: image.map(str::to_owned),
+            prefix: "/rooms".to_owned(),
+            ..TopicNames::default()
+        };
+        let predicted = |prefix| channel(1, &format!("{prefix}/predicted"), "sensor_msgs/msg/CompressedImage");
+        let any = names(None);
+        let mut topics = Topics::new(&any, &spec);
+        assert_eq!(topics.choose(&predicted("/rooms")).unwrap(), ChannelUse::Unused);
+        assert_eq!(topics.choose(&predicted("/moving")).unwrap(), ChannelUse::Prediction);
+        let other = names(Some("/moving/predicted"));
+        assert!(other.check().is_ok());
+        let chosen = Topics::new(&other, &spec).choose(&predicted("/moving")).unwrap();
+        assert_eq!(chosen, ChannelUse::Subscribed(LiveRole::Image));
+        let error = names(Some("/rooms/predicted")).check().unwrap_err().to_string();
+        assert!(error.starts_with("--image names /rooms/predicted, which this bridge itself publishes"));
     }
 
     #[test]
@@ -222,8 +362,9 @@ mod tests {
             ..TopicNames::default()
         };
         let mut topics = Topics::new(&named, &spec);
-        assert_eq!(topics.choose(&json("/other")).unwrap(), None);
-        assert_eq!(topics.choose(&json("/command")).unwrap(), Some(LiveRole::Command));
+        assert_eq!(topics.choose(&json("/other")).unwrap(), ChannelUse::Unused);
+        let command = ChannelUse::Subscribed(LiveRole::Command);
+        assert_eq!(topics.choose(&json("/command")).unwrap(), command);
         let seen = topics
             .read(LiveRole::Command, br#"{"speed":0.5,"mode":"auto"}"#)
             .unwrap();

@@ -1,14 +1,14 @@
 //! `foreframe adapt`
 
 use std::fs;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use super::error::CliError;
 use super::interrupt;
-use super::next_step::shell_path;
+use super::next_step::{name_from, shell_path};
 use super::process::{command_line, print_line};
 use super::settings::DirectoryArgs;
-use super::train::OneTraining;
+use super::train::{OneTraining, warn_of};
 use super::workspace::Workspace;
 use foreframe_core::error_kind::{ErrorKind, HasErrorKind as _};
 use foreframe_core::registry;
@@ -63,7 +63,8 @@ pub(super) fn run(args: &AdaptArgs) -> Result<(), CliError> {
     let (_, base) = workspace.load_model(&args.from)?;
     let start = workspace.load_weights(&args.from)?;
     let (directory, dataset) = workspace.open_dataset(&args.dataset)?;
-    let settings = settings(args, &dataset.info().name)?;
+    let settings = settings(args, &directory)?;
+    warn_of(&dataset);
     let cancelled = interrupt::flag()?;
     let adaptation = Adaptation::of(&base, dataset, &settings, &cancelled)
         .map_err(interrupted("stopped before the training; nothing was written"))?;
@@ -111,20 +112,27 @@ fn interrupted(sentence: &'static str) -> impl Fn(AdaptError) -> CliError {
     }
 }
 
-/// What the arguments say, for a data set of that name.
-fn settings(args: &AdaptArgs, dataset: &str) -> Result<AdaptSettings, CliError> {
+/// What the arguments say, for the data set in that directory.
+fn settings(args: &AdaptArgs, dataset: &Path) -> Result<AdaptSettings, CliError> {
+    let layers = args.settings.iter().map(|setting| SettingsLayer::assignment(setting));
+    let layers = layers.collect::<Result<Vec<_>, _>>()?;
+    if layers.iter().any(|layer| layer.keys().any(|key| key == "name")) {
+        let right = "--set name does not name the adapted model; use --name";
+        return Err(CliError::Usage(right.to_owned()));
+    }
     let name = if let Some(name) = &args.name {
         name.clone()
     } else {
-        let name = format!("{dataset}-adapted").parse();
+        let path = dataset.canonicalize().unwrap_or_else(|_| dataset.to_owned());
+        let of_dataset = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        let name = format!("{}-adapted", name_from(&of_dataset, "recording")).parse();
         name.map_err(|error: ValueError| CliError::Usage(format!("{error}; give another --name")))?
     };
-    let layers = args.settings.iter().map(|setting| SettingsLayer::assignment(setting));
     Ok(AdaptSettings {
         name,
         steps: args.steps,
         mirror: args.mirror.clone(),
         remember: args.remember,
-        layers: layers.collect::<Result<_, _>>()?,
+        layers,
     })
 }

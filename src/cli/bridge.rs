@@ -1,5 +1,6 @@
 //! `foreframe bridge`
 
+use std::ops::RangeInclusive;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -11,11 +12,12 @@ use super::interrupt;
 use super::process::print_line;
 use super::settings::CommonArgs;
 use super::workspace::Workspace;
-use crate::bridge::{self, BridgeEvent, LiveStep, RobotAddress, TopicNames};
-use foreframe_data::dataset::import::live::LiveRole;
+use crate::bridge::{self, BridgeEvent, BridgeSettings, LiveStep, RobotAddress, TopicNames};
 
 /// How often a line says how it goes.
 const LINE_EVERY: Duration = Duration::from_secs(5);
+/// The seconds that an option takes.
+const SECONDS: RangeInclusive<f64> = 0.1..=86_400.0;
 
 /// Predict for a running robot that has a Foxglove bridge.
 ///
@@ -24,7 +26,7 @@ const LINE_EVERY: Duration = Duration::from_secs(5);
 /// the present frame (mean squared, a Float64); `PREFIX/expected_error`, the error to expect of that last predicted frame (a
 /// Float64). Images are `sensor_msgs/msg/Image` or CompressedImage in CDR, or `foxglove.RawImage` or CompressedImage. Commands and odometry
 /// are messages of ROS 2 in CDR or JSON; a topic that is named can also have any other object in JSON, whose numbers are found by the
-/// names of the model's channels. The program ends when the robot closes the connection.
+/// names of the model's channels. The program ends when the robot closes the connection, or when nothing comes from it for some seconds.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   foreframe bridge ws://192.168.1.20:8765 --model rooms
@@ -51,6 +53,12 @@ pub(super) struct BridgeArgs {
     /// What the names of the published topics begin with
     #[arg(long, value_name = "PREFIX", default_value = "/foreframe")]
     prefix: String,
+    /// End when nothing came from the robot for so many seconds, not even the answer to a ping
+    #[arg(long, value_name = "S", default_value = "10", value_parser = seconds)]
+    idle_limit: Duration,
+    /// The age in seconds up to which a state is used as the present one
+    #[arg(long, value_name = "S", default_value = "1", value_parser = seconds)]
+    state_age_limit: Duration,
     #[command(flatten)]
     settings: CommonArgs,
 }
@@ -58,26 +66,35 @@ pub(super) struct BridgeArgs {
 pub(super) fn run(args: BridgeArgs) -> Result<(), CliError> {
     let workspace = Workspace::new(args.settings.start()?);
     let (_, model) = workspace.load_model(&args.model)?;
-    let names = TopicNames {
-        image: args.image,
-        action: args.action,
-        state: args.state,
-        prefix: args.prefix,
+    let settings = BridgeSettings {
+        address: RobotAddress {
+            url: args.address,
+            ca_certificate: args.ca_certificate,
+            idle_limit: args.idle_limit,
+        },
+        names: TopicNames {
+            image: args.image,
+            action: args.action,
+            state: args.state,
+            prefix: args.prefix,
+        },
+        state_age_limit: args.state_age_limit,
     };
     let cancelled = interrupt::flag()?;
     let mut log = BridgeLog::default();
-    let address = RobotAddress {
-        url: args.address,
-        ca_certificate: args.ca_certificate,
-    };
     bridge::run(
-        &address,
-        &names,
+        &settings,
         &Arc::new(model),
         &mut |event| log.on_event(event),
         &cancelled,
     )?;
     Ok(())
+}
+
+fn seconds(text: &str) -> Result<Duration, String> {
+    let parsed = text.parse().ok().filter(|seconds| SECONDS.contains(seconds));
+    let wrong = || format!("give a number of seconds, {} to {}", SECONDS.start(), SECONDS.end());
+    parsed.map(Duration::from_secs_f64).ok_or_else(wrong)
 }
 
 /// Prints what happens, and now and then how it goes.
@@ -99,15 +116,12 @@ impl BridgeLog {
                 }
                 return;
             }
-            BridgeEvent::Connected(name) => format!("connected to \"{name}\""),
-            BridgeEvent::Subscribed { role, topic } => {
-                let what = match role {
-                    LiveRole::Image => "image",
-                    LiveRole::Command => "action",
-                    LiveRole::Measurement => "state",
-                };
-                format!("{what}: {topic}")
+            BridgeEvent::Notice(text) => {
+                warn!("{text}");
+                return;
             }
+            BridgeEvent::Connected(name) => format!("connected to \"{name}\""),
+            BridgeEvent::Subscribed { role, topic } => format!("{}: {topic}", bridge::word(role)),
             BridgeEvent::Predicted(step) => {
                 self.frames += 1;
                 self.latest = step;

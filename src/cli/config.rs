@@ -24,6 +24,7 @@ pub(super) struct ConfigArgs {
 
 pub(super) fn run(args: &ConfigArgs) -> Result<(), CliError> {
     let loaded = args.settings.load()?;
+    loaded.choose_computation()?;
     if args.json {
         return print_line(serde_json::to_string_pretty(&loaded.to_json()).map_err(CliError::failed)?);
     }

@@ -44,13 +44,13 @@ use foreframe_train::evaluation::figures::episode_animation::episode_gif;
   foreframe drive --scenario crossing --model rooms --driver stop,plan --out drive")]
 pub(super) struct DriveArgs {
     /// The scenario: moving-observer, crowded or crossing
-    #[arg(long, default_value = "crowded")]
+    #[arg(long, default_value_t = DriveSettings::default().scenario)]
     scenario: Scenario,
     /// Each episode in a room of its own from that set: varied, new-materials or new-cameras [default: the same room]
     #[arg(long, value_name = "SET")]
     rooms: Option<RoomSet>,
     /// Number of episodes
-    #[arg(long, default_value_t = 20, value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    #[arg(long, default_value_t = DriveSettings::default().episodes as u32, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     episodes: u32,
     /// The same seed gives the same episodes and goals
     #[arg(long, default_value_t = 0)]
@@ -62,7 +62,7 @@ pub(super) struct DriveArgs {
     #[arg(long)]
     model: Option<String>,
     /// Longest time of an episode, in seconds
-    #[arg(long, value_name = "S", default_value_t = 20.0)]
+    #[arg(long, value_name = "S", default_value_t = DriveSettings::default().duration_s)]
     duration: f64,
     /// The time for each plan of the drivers velocity, visible, places and plan, in milliseconds; without it, searches are whole, and a drive can be repeated
     #[arg(long, value_name = "MS", value_parser = clap::value_parser!(u64).range(1..=10_000))]

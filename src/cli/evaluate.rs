@@ -18,7 +18,9 @@ use foreframe_core::registry::{self, Model};
 use foreframe_core::types::Seed;
 use foreframe_data::dataset::Dataset;
 use foreframe_jobs::jobs::spec::MAX_RESAMPLES;
-use foreframe_train::evaluation::{self, EvaluateConfig, EvaluationReport, NEAREST_WINDOWS, ScoredSplit};
+use foreframe_train::evaluation::{
+    self, EvaluateConfig, EvaluationReport, MIN_RESAMPLES, NEAREST_WINDOWS, ScoredSplit,
+};
 
 /// The page that `--html` adds to the report.
 const PAGE: &str = "report.html";
@@ -69,8 +71,8 @@ pub(super) struct EvaluateArgs {
     /// with a baseline that knows as little
     #[arg(long, value_name = "WINDOWS", default_value_t = NEAREST_WINDOWS as u32, value_parser = value_parser!(u32).range(1..))]
     nearest_windows: u32,
-    /// Bootstrap resamples of the trials or blocks of time, for the intervals
-    #[arg(long, default_value_t = EvaluateConfig::default().bootstrap_samples as u32, value_parser = value_parser!(u32).range(1..=MAX_RESAMPLES as i64))]
+    /// Bootstrap resamples of the trials or blocks of time, for the intervals; at least 100
+    #[arg(long, default_value_t = EvaluateConfig::default().bootstrap_samples as u32, value_parser = value_parser!(u32).range(MIN_RESAMPLES as i64..=MAX_RESAMPLES as i64))]
     resamples: u32,
     /// Multiply the intensities of all frames of the scored data set, inputs and truth, by this before anything is scored, and
     /// limit them to white: does the model still predict in darker or brighter light? From 0.1 to 3

@@ -15,6 +15,26 @@ pub(super) struct KeyOrder<'a> {
 
 /// Stores a new key and returns its text, of which only the hash is kept. Errors: `Failed`.
 pub(super) async fn create_key(store: &Store, order: KeyOrder<'_>) -> Result<String, CliError> {
+    let (row, text) = new_row(store, order).await?;
+    store.add_key(row, &Author::CommandLine).await?;
+    Ok(text)
+}
+
+/// The same for the first key, which may do everything; `None` if another server was faster. Errors: `Failed`.
+pub(super) async fn create_first_key(store: &Store) -> Result<Option<String>, CliError> {
+    let order = KeyOrder {
+        name: "first",
+        scope: KeyScope::Admin,
+        valid_s: None,
+        requests_per_s: None,
+    };
+    let (row, text) = new_row(store, order).await?;
+    let is_first = store.add_first_key(row, &Author::CommandLine).await?;
+    Ok(is_first.then_some(text))
+}
+
+/// A key that is not stored yet, and its text.
+async fn new_row(store: &Store, order: KeyOrder<'_>) -> Result<(KeyRow, String), CliError> {
     let key = NewKey::generate().map_err(CliError::failed)?;
     let now_s = store.now_s().await?;
     let row = KeyRow {
@@ -27,6 +47,5 @@ pub(super) async fn create_key(store: &Store, order: KeyOrder<'_>) -> Result<Str
         expires_s: order.valid_s.map(|seconds| now_s + seconds),
         requests_per_s: order.requests_per_s,
     };
-    store.add_key(row, &Author::CommandLine).await?;
-    Ok(key.text)
+    Ok((row, key.text))
 }

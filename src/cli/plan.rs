@@ -51,31 +51,31 @@ pub(super) struct PlanArgs {
     #[arg(long, value_name = "FILE")]
     goal_image: Option<PathBuf>,
     /// How plans are chosen: random-shooting, cem or mppi
-    #[arg(long, default_value = "cem", value_parser = solver)]
+    #[arg(long, default_value_t = SolverSettings::default().kind)]
     solver: SolverKind,
     /// Plans of an iteration
-    #[arg(long, default_value_t = 256)]
+    #[arg(long, default_value_t = SolverSettings::default().samples)]
     samples: usize,
     /// How often the solver learns from the costs and draws again
-    #[arg(long, default_value_t = 4)]
+    #[arg(long, default_value_t = SolverSettings::default().iterations)]
     iterations: usize,
     /// The same seed draws the same plans
-    #[arg(long, default_value_t = 0)]
+    #[arg(long, default_value_t = SolverSettings::default().seed)]
     seed: u64,
     /// The time for the search, in milliseconds; without it, the search is whole, and the answer is always the same
     #[arg(long, value_name = "MS")]
     budget_ms: Option<u64>,
     /// How many of the best plans are predicted and compared at the end
-    #[arg(long, default_value_t = 4)]
+    #[arg(long, default_value_t = PlanSettings::default().finalists)]
     finalists: usize,
     /// Actions of a plan [default: the model's horizon]
     #[arg(long, value_name = "N")]
     steps: Option<usize>,
     /// Radius of the robot, in metres
-    #[arg(long, value_name = "M", default_value_t = 0.18)]
+    #[arg(long, value_name = "M", default_value_t = PlanSettings::default().radius_m)]
     radius: f32,
     /// The distance that the robot should keep, in metres
-    #[arg(long, value_name = "M", default_value_t = 0.15)]
+    #[arg(long, value_name = "M", default_value_t = PlanSettings::default().margin_m)]
     margin: f32,
     /// Print the answer as JSON
     #[arg(long)]
@@ -212,16 +212,4 @@ fn place(text: &str) -> Result<[f32; 2], String> {
     let parts: Vec<f32> = text.split(',').filter_map(|part| part.trim().parse().ok()).collect();
     <[f32; 2]>::try_from(parts)
         .map_err(|_| "two numbers are needed: metres ahead and to the left, as in 0.5,-0.2".to_owned())
-}
-
-fn solver(text: &str) -> Result<SolverKind, String> {
-    let known = [
-        ("random-shooting", SolverKind::RandomShooting),
-        ("cem", SolverKind::Cem),
-        ("mppi", SolverKind::Mppi),
-    ];
-    let found = known.into_iter().find(|(name, _)| *name == text);
-    found
-        .map(|(_, kind)| kind)
-        .ok_or_else(|| "it is random-shooting, cem or mppi".to_owned())
 }

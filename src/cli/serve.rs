@@ -5,14 +5,14 @@ use tracing::{info, warn};
 
 use super::admin_address::{self, ADMIN_BIND};
 use super::error::CliError;
-use super::new_key::{KeyOrder, create_key};
+use super::new_key::create_first_key;
 use super::process::print_line;
 use super::settings::{ServerArgs, open_store_waiting, with_checked_directories};
 use crate::config::Config;
 use crate::server::keys::Keys;
 use crate::server::{self, App, ServerListeners, ServerTls};
 use crate::telemetry;
-use foreframe_jobs::store::{KeyScope, Store};
+use foreframe_jobs::store::Store;
 
 /// Serve models over HTTP and WebSocket (the default command).
 ///
@@ -107,18 +107,17 @@ fn report_models(app: &App) {
     }
 }
 
-/// Creates a key and prints it; to standard output only, not to the log.
+/// Creates a key and prints it; to standard output only, not to the log. Another server that starts now may have done it.
 async fn print_first_key(store: &Store) -> Result<(), CliError> {
-    let order = KeyOrder {
-        name: "first",
-        scope: KeyScope::Admin,
-        valid_s: None,
-        requests_per_s: None,
-    };
-    let key = create_key(store, order).await?;
-    print_line(format!(
-        "API key, printed this once: {key} — create others with foreframe keys create NAME, and then revoke this one"
-    ))
+    match create_first_key(store).await? {
+        Some(key) => print_line(format!(
+            "API key, printed this once: {key} — create others with foreframe keys create NAME, and then revoke this one"
+        )),
+        None => {
+            info!("another server made the first API key, and printed it");
+            Ok(())
+        }
+    }
 }
 
 /// The API keys. Errors: `Usage` if other machines can reach the server and there is no key.

@@ -15,10 +15,13 @@ use super::progress::ProgressLine;
 use super::settings::DirectoryArgs;
 use super::workspace::Workspace;
 use crate::config::is_setting;
+use foreframe_core::frame::warp::CameraModel;
 use foreframe_core::registry::{Manifest, StoredWeights};
-use foreframe_data::dataset::Dataset;
+use foreframe_data::dataset::{Dataset, DatasetPart};
+use foreframe_data::inspection::small_channels;
 use foreframe_train::evaluation;
 use foreframe_train::settings::SettingsLayer;
+use foreframe_train::training::config::ArchitectureConfig;
 use foreframe_train::training::{self, Sweep, TrainConfig, Training, TrainingEvent, TrainingOutcome, TrainingStage};
 
 /// Train a model on a data set.
@@ -102,6 +105,11 @@ pub(super) fn run(args: &TrainArgs) -> Result<(), CliError> {
         weighted.push((dataset, *weight));
     }
     let dataset = Dataset::join(weighted, config.lacking())?;
+    for config in &configs {
+        training::parameter_count(config, dataset.info())?;
+    }
+    warn_of(&dataset);
+    note_camera(&dataset, &config);
     let run_dir = args
         .out
         .clone()
@@ -125,19 +133,64 @@ pub(super) fn run(args: &TrainArgs) -> Result<(), CliError> {
         return sweep::print_table(&finished, &flags);
     }
     let (model_dir, manifest) = one.run(&config, &run_dir)?;
-    let evaluations = directories.iter().map(|directory| {
+    let parts = dataset.parts();
+    let (mut evaluations, mut unfit) = (String::new(), Vec::new());
+    for (directory, part) in directories.iter().zip(&parts) {
+        if let Err(error) = evaluation::check_fit(&manifest, &part.info) {
+            unfit.push(error.to_string());
+            continue;
+        }
         let (model, dataset) = (shell_path(&model_dir), shell_path(directory));
-        format!("foreframe evaluate --model {model} --dataset {dataset}{flags}\n      ")
-    });
+        evaluations += &format!("foreframe evaluate --model {model} --dataset {dataset}{flags}\n      ");
+    }
+    for reason in unfit {
+        print_line(format!(
+            "note: the model cannot be evaluated on one of its data sets: {reason}"
+        ))?;
+    }
     print_line(format!(
         "{}: {} parameters, validation MSE {:.6} at step {}\nnext: {}foreframe publish {}{flags}",
         model_dir.display(),
         manifest.parameters,
         manifest.metrics["validation"]["mse"].as_f64().unwrap_or(f64::NAN),
         manifest.metrics["validation"]["step"],
-        evaluations.collect::<String>(),
+        evaluations,
         shell_path(&run_dir),
     ))
+}
+
+/// Warns of channels that the networks see too small.
+pub(super) fn warn_of(dataset: &Dataset) {
+    for sentence in small_channels(dataset) {
+        tracing::warn!("{sentence}");
+    }
+}
+
+/// Says that a model is trained without a camera, since its data sets do not have the same. One that sees depth takes that of each episode.
+fn note_camera(dataset: &Dataset, config: &TrainConfig) {
+    let takes_one = matches!(config.model.architecture, ArchitectureConfig::Flow(layers) if !layers.depth);
+    if !(takes_one && dataset.lost_camera()) {
+        return;
+    }
+    let camera = |part: &DatasetPart| match part.info.camera {
+        Some(CameraModel {
+            horizontal_fov_rad,
+            tilt_down_rad,
+            ..
+        }) => format!(
+            "\"{}\" {:.1}° wide, tilted down {:.1}°",
+            part.info.name,
+            horizontal_fov_rad.to_degrees(),
+            tilt_down_rad.to_degrees()
+        ),
+        None => format!("\"{}\" not known", part.info.name),
+    };
+    let cameras: Vec<String> = dataset.parts().iter().map(camera).collect();
+    tracing::warn!(
+        "the data sets do not have the same camera ({}), so the model is trained without a camera model; --fov and --tilt of the \
+         import describe it",
+        cameras.join("; ")
+    );
 }
 
 /// What all trainings of a command share.

@@ -75,7 +75,7 @@ async fn worker_readyz(State(worker): State<WorkerHealth>) -> Result<impl IntoRe
     if *worker.is_stopping.borrow() {
         return Err(ApiError::unavailable("the worker is stopping"));
     }
-    health::ready(&worker.store).await
+    health::worker_ready(&worker.store).await
 }
 
 async fn worker_metrics(State(worker): State<WorkerHealth>) -> impl IntoResponse {

@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
+use crate::telemetry::LogFormat;
 use foreframe_core::nn::device::DeviceName;
 use foreframe_core::nn::precision::Precision;
 use foreframe_core::nn::spec::MAX_STEPS;
@@ -34,6 +35,8 @@ type Bound = (&'static str, u64, RangeInclusive<u64>);
 
 /// A day: no deadline is longer.
 const MAX_DEADLINE_MS: u64 = 86_400_000;
+/// The most rollouts of a batch: a step of a stream waits for all of them, with `moving` about a fifth of a second on two cores.
+const MAX_BATCH: u64 = 512;
 /// The most of what the server counts.
 const MAX_COUNT: u64 = 1_000_000;
 
@@ -110,8 +113,9 @@ settings! {
     max_queued_predictions: usize = 256, 1..=MAX_COUNT;
     /// Maximum number of rollouts in a batch; one request gets at most a quarter of a batch, and
     /// less where its rollouts are longer than the horizon. On the CPU, flow and sprite
-    /// networks gain nothing from batches: at most one rollout for each core, or one larger request, is computed at a time.
-    max_batch: usize = 64, 1..=4096;
+    /// networks gain nothing from batches: at most one rollout for each core, or one larger request, is computed at a time. Frames of
+    /// streams wait for the batch before them.
+    max_batch: usize = 64, 1..=MAX_BATCH;
     /// Maximum size of all request bodies and messages of streams that the server reads or works with at the same time, in
     /// bytes; more requests are refused with 503, more streams closed with 1013. At least `max_body_bytes`.
     max_total_body_bytes: usize = 256 << 20, config.max_body_bytes as u64..=1 << 40;
@@ -185,6 +189,9 @@ settings! {
     /// The program whose `run-job` runs each job in a process of its own; without one, jobs run in this process.
     #[serde(skip)]
     job_program: Option<PathBuf> = None;
+    /// The format of the log lines of that program: that of this process.
+    #[serde(skip)]
+    job_log_format: LogFormat = LogFormat::Text;
     /// How long a lease of a job lasts without renewal, in milliseconds. After that, another process can claim the job.
     job_lease_ms: u64 = 30_000, 1000..=MAX_DEADLINE_MS;
     /// How long a prediction may take, including its time in the queue, in milliseconds.
@@ -195,6 +202,8 @@ settings! {
     max_upload_mib: u64 = 2048, 0..=1 << 24;
     /// Maximum number of uploads that are received or wait for the end of their import; more are refused with 503.
     max_uploads: usize = 16, 1..=10_000;
+    /// Maximum number of these uploads from one API key; more are refused with 429. Uploads from before the last start do not count.
+    max_uploads_per_key: usize = 8, 1..=10_000;
     /// How long an upload may take, in milliseconds.
     upload_deadline_ms: u64 = 3_600_000, 1..=MAX_DEADLINE_MS;
     /// How long an uploaded file is kept that no import uses, in milliseconds.
@@ -274,6 +283,7 @@ impl ServerConfig {
             store: self.store(),
             models_dir: self.models_dir.clone(),
             resources: self.job_resources(),
+            log_format: self.job_log_format.name().to_owned(),
         })
     }
 

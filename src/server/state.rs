@@ -24,6 +24,7 @@ use super::http::task_limit::{TaskLimit, stop_requested};
 use super::http::tls::ServerTls;
 use super::inference_statistics::InferenceStatistics;
 use super::render_cache::RenderCache;
+use super::shared_reading::SharedReading;
 use super::stream::session_table::SessionTable;
 use super::uploads::Uploads;
 use super::world_session::SharedWorldSession;
@@ -67,6 +68,8 @@ pub struct AppState {
     pub(super) config: Arc<ServerConfig>,
     pub(super) streams: TaskLimit,
     pub(super) event_streams: TaskLimit,
+    /// Hashes of the lists whose changes their clients hear of.
+    pub(super) compared_lists: SharedReading<[u64; 2]>,
     /// The requests that are being processed.
     pub(super) requests: TaskLimit,
     pub(super) admission: Admission,
@@ -133,6 +136,7 @@ impl App {
             shared: Arc::new(AppState {
                 streams: TaskLimit::new("streams are open", config.max_streams),
                 event_streams: TaskLimit::new("event streams are open", config.max_event_streams),
+                compared_lists: SharedReading::default(),
                 requests: TaskLimit::new("requests are being processed", config.max_requests),
                 admission: Admission::new(&config),
                 body_budget: BodyBudget::new(&config),

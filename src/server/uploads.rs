@@ -1,5 +1,6 @@
 //! The files that clients upload for their imports: received piece by piece, bounded in size, number and time.
 
+use std::collections::HashMap;
 use std::fs::{self, File};
 use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
@@ -12,6 +13,7 @@ use tracing::{info, warn};
 
 use super::blocking::BlockingWork;
 use super::config::ServerConfig;
+use super::http::keys::Caller;
 use super::http::problem::ApiError;
 use foreframe_core::files::{none_if_missing, partial_path, remove_dir};
 use foreframe_jobs::jobs::uploads::{UPLOADS_DIR, UploadedFile};
@@ -22,6 +24,8 @@ use foreframe_jobs::store::{Objects, StoreError};
 const PIECE_BYTES: usize = 1 << 20;
 /// How long nothing may arrive of a file that is being received until it counts as left by a server that was killed.
 const MAX_PAUSE: Duration = Duration::from_mins(5);
+/// When a key whose share is used up may try again, in seconds: an import takes a while.
+const SHARE_RETRY_AFTER_S: u64 = 10;
 /// Import jobs in which an upload is looked for, the newest.
 const MAX_IMPORTS: usize = 1000;
 
@@ -30,9 +34,10 @@ pub(super) struct Uploads {
     dir: PathBuf,
     max_bytes: u64,
     max_count: usize,
+    max_count_per_key: usize,
     keep: Duration,
-    /// Held while places are counted and one is taken.
-    turn: Mutex<()>,
+    /// Who sent each upload since the server started; locked while places are counted and one is taken.
+    senders: Mutex<HashMap<String, Caller>>,
 }
 
 impl Uploads {
@@ -41,21 +46,24 @@ impl Uploads {
             dir: config.data_dir.join(UPLOADS_DIR),
             max_bytes: config.max_upload_mib << 20,
             max_count: config.max_uploads,
+            max_count_per_key: config.max_uploads_per_key,
             keep: Duration::from_millis(config.upload_idle_ms),
-            turn: Mutex::new(()),
+            senders: Mutex::default(),
         }
     }
 
     /// Writes a body to a file. What was written is deleted if an error occurs or the client goes away. Returns how many bytes it
-    /// has. Errors: `Unavailable` if there are too many uploads, `TooLarge`, `Unprocessable` if it is empty, `Malformed`.
+    /// has. Errors: `Unavailable` if there are too many uploads, `TooMany` of this key, `TooLarge`, `Unprocessable` if it is empty,
+    /// `Malformed`.
     pub(super) async fn receive(
         &self,
         file: &UploadedFile,
+        sender: Caller,
         body: Body,
         threads: &BlockingWork,
     ) -> Result<u64, ApiError> {
         let path = file.path(self.dir.parent().unwrap_or(&self.dir));
-        let place = self.place(&path, threads).await?;
+        let place = self.place(&path, sender, threads).await?;
         let opened = threads.run(move || PartialFile::create(path)).await?;
         let PartialFile {
             partial,
@@ -110,26 +118,50 @@ impl Uploads {
         })
     }
 
-    /// Makes the directory of an upload. Errors: `Unavailable`.
-    async fn place(&self, path: &Path, threads: &BlockingWork) -> Result<UploadPlace, ApiError> {
-        let _turn = self.turn.lock().await;
-        let (uploads, max_count) = (self.dir.clone(), self.max_count);
+    /// Makes the directory of an upload. Errors: `Unavailable`, `TooMany`.
+    async fn place(&self, path: &Path, sender: Caller, threads: &BlockingWork) -> Result<UploadPlace, ApiError> {
+        let mut senders = self.senders.lock().await;
+        let uploads = self.dir.clone();
+        let listed = threads.run(move || names(&uploads)).await?;
+        let present = listed.map_err(|error| away(&self.dir, error))?;
+        senders.retain(|id, _| present.contains(id));
+        self.check_places(present.len(), sender, &senders)?;
         let place = UploadPlace {
             dir: path.parent().map(Path::to_owned),
         };
+        let id = place
+            .dir
+            .as_deref()
+            .and_then(Path::file_name)
+            .map(|id| id.to_string_lossy().into_owned());
         let made = threads.run(move || {
-            if names(&uploads)?.len() >= max_count {
-                return Ok(None);
-            }
             place.dir.as_deref().map_or(Ok(()), fs::create_dir_all)?;
-            Ok(Some(place))
+            Ok(place)
         });
-        let made = made.await?.map_err(|error: io::Error| away(&self.dir, error))?;
-        made.ok_or_else(|| {
-            ApiError::unavailable(format!(
+        let place = made.await?.map_err(|error: io::Error| away(&self.dir, error))?;
+        senders.extend(id.map(|id| (id, sender)));
+        Ok(place)
+    }
+
+    /// Errors: `Unavailable` if all places are taken, `TooMany` if the sender's key has its share of them.
+    fn check_places(&self, taken: usize, sender: Caller, senders: &HashMap<String, Caller>) -> Result<(), ApiError> {
+        let (max_count, share) = (self.max_count, self.max_count_per_key);
+        if taken >= max_count {
+            return Err(ApiError::unavailable(format!(
                 "{max_count} uploads wait for their imports already (setting max_uploads); import them, or try again later"
-            ))
-        })
+            )));
+        }
+        let own = senders.values().filter(|other| sender.has_key_of(**other)).count();
+        if own >= share {
+            return Err(ApiError::TooMany {
+                detail: format!(
+                    "{share} uploads of this API key wait for their imports already (setting max_uploads_per_key); import or \
+                     delete them, or try again later"
+                ),
+                retry_after_s: SHARE_RETRY_AFTER_S,
+            });
+        }
+        Ok(())
     }
 
     /// The ids of the uploads of this server.
@@ -180,7 +212,10 @@ impl Uploads {
         for name in names {
             if self.is_over(&name, &imports) {
                 objects.delete(&format!("{UPLOADS_DIR}/{name}")).await?;
-                info!(upload = name, "deleted an upload: its import has ended, or none began");
+                info!(
+                    upload = name,
+                    "deleted an upload: its import has ended, none began, or it was deleted elsewhere"
+                );
             }
         }
         Ok(())

@@ -77,6 +77,8 @@ fn rooms_is_scored_on_a_car_and_adapted_to_it_unless_it_gets_worse() {
     assert_eq!(refused.status.code(), Some(2));
     assert!(text(&refused.stderr).contains("angle"), "{}", text(&refused.stderr));
 
+    let renamed = run("adapt car --set name=other");
+    assert_refused("adapt", "use --name", &renamed);
     let short = "--set sequence.batch_size=2 --set run.warmup_steps=0 --steps 4";
     let adapted = run(&format!(
         "adapt car --mirror action.angle {short} --set sequence.learning_rate=0.0003"

@@ -1,8 +1,10 @@
 //! `foreframe bridge` with a robot that speaks Foxglove's WebSocket protocol, played by the test.
 
-use std::io::Read as _;
+use std::collections::BTreeMap;
+use std::io::{BufRead as _, BufReader, Read as _};
 use std::net::{TcpListener, TcpStream};
-use std::process::{Child, Stdio};
+use std::path::Path;
+use std::process::{Child, ChildStderr, Stdio};
 
 use foreframe_core::frame::{Frame, codec};
 use foreframe_core::nn::Conditioning;
@@ -15,23 +17,32 @@ use crate::bag_files::{image, odometry, twist};
 use crate::process::foreframe;
 use crate::service::{CONTEXT, HEIGHT, HORIZON, TIMEOUT, WIDTH, frame, model, spec};
 
-const PERIOD_NS: u64 = 200_000_000;
+pub(crate) const PERIOD_NS: u64 = 200_000_000;
 pub(crate) const PROTOCOL: &str = "foxglove.sdk.v1";
 
 /// The bridge as a process, and the robot that it has connected to.
-struct Robot {
+pub(crate) struct Robot {
     bridge: Child,
+    stderr: BufReader<ChildStderr>,
     socket: WebSocket<TcpStream>,
 }
 
 impl Robot {
     /// Starts the bridge with a small model, and says which channels there are.
-    fn start(dir: &std::path::Path, arguments: &[&str], capabilities: &[&str], channels: &Value) -> Self {
+    pub(crate) fn start(dir: &Path, arguments: &[&str], capabilities: &[&str], channels: &Value) -> Self {
         model(dir, "moving", spec(Conditioning::StateAction));
+        let mut robot = Self::connect(dir, "./moving", arguments);
+        robot.say(&json!({"op": "serverInfo", "name": "test robot", "capabilities": capabilities}));
+        robot.say(&json!({"op": "advertise", "channels": channels}));
+        robot
+    }
+
+    /// Starts the bridge with this model, and says nothing yet.
+    pub(crate) fn connect(dir: &Path, model: &str, arguments: &[&str]) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         let address = format!("ws://{}", listener.local_addr().unwrap());
-        let bridge = foreframe(dir)
-            .args(["bridge", &address, "--model", "./moving"])
+        let mut bridge = foreframe(dir)
+            .args(["bridge", &address, "--model", model])
             .args(arguments)
             .stdout(Stdio::piped())
             .stderr(Stdio::piped())
@@ -46,31 +57,54 @@ impl Robot {
             headers.insert("sec-websocket-protocol", HeaderValue::from_static(PROTOCOL));
             Ok(response)
         };
-        let mut robot = Self {
+        Self {
+            stderr: BufReader::new(bridge.stderr.take().unwrap()),
             bridge,
             socket: accept_hdr(stream, choose).unwrap(),
-        };
-        robot.say(&json!({"op": "serverInfo", "name": "test robot", "capabilities": capabilities}));
-        robot.say(&json!({"op": "advertise", "channels": channels}));
-        robot
+        }
     }
 
-    fn say(&mut self, message: &Value) {
+    pub(crate) fn say(&mut self, message: &Value) {
         self.socket.send(Message::text(message.to_string())).unwrap();
     }
 
-    fn heard(&mut self) -> Value {
-        serde_json::from_str(self.socket.read().unwrap().to_text().unwrap()).unwrap()
+    /// The next message of the bridge; a ping gets its answer when the next one is read.
+    pub(crate) fn read(&mut self) -> Message {
+        self.socket.read().unwrap()
     }
 
-    fn data(&mut self, subscription: u32, time_ns: u64, payload: &[u8]) {
+    fn read_data(&mut self) -> Message {
+        loop {
+            let message = self.read();
+            if !message.is_ping() {
+                return message;
+            }
+        }
+    }
+
+    pub(crate) fn heard(&mut self) -> Value {
+        serde_json::from_str(self.read_data().to_text().unwrap()).unwrap()
+    }
+
+    /// The subscriptions that come next: the number of each, by its channel.
+    pub(crate) fn subscriptions(&mut self, count: usize) -> BTreeMap<u64, u32> {
+        let mut subscriptions = BTreeMap::new();
+        for _ in 0..count {
+            let asked = &self.heard()["subscriptions"][0];
+            let [channel, id] = ["channelId", "id"].map(|name| asked[name].as_u64().unwrap());
+            subscriptions.insert(channel, id as u32);
+        }
+        subscriptions
+    }
+
+    pub(crate) fn data(&mut self, subscription: u32, time_ns: u64, payload: &[u8]) {
         let message = [&[1][..], &subscription.to_le_bytes(), &time_ns.to_le_bytes(), payload].concat();
         self.socket.send(Message::binary(message)).unwrap();
     }
 
     /// The next message of the bridge with data: the number of its channel, and the message.
-    fn published(&mut self) -> (u32, Vec<u8>) {
-        let message = self.socket.read().unwrap().into_data();
+    pub(crate) fn published(&mut self) -> (u32, Vec<u8>) {
+        let message = self.read_data().into_data();
         assert_eq!(message[0], 1);
         (
             u32::from_le_bytes(*message[1..].first_chunk().unwrap()),
@@ -78,19 +112,57 @@ impl Robot {
         )
     }
 
+    /// The next predicted frame as a message.
+    pub(crate) fn predicted(&mut self) -> Vec<u8> {
+        loop {
+            let (topic, message) = self.published();
+            if topic == 1 {
+                return message;
+            }
+        }
+    }
+
+    /// The next line on standard error that has this text. Without one, fails when the bridge ends.
+    pub(crate) fn warned(&mut self, text: &str) -> String {
+        let mut read = String::new();
+        loop {
+            let mut line = String::new();
+            let count = self.stderr.read_line(&mut line).unwrap();
+            assert!(count > 0, "no \"{text}\" in:\n{read}");
+            if line.contains(text) {
+                return line;
+            }
+            read += &line;
+        }
+    }
+
     /// Ends the connection; what the bridge printed to standard output, and to standard error.
-    fn end(mut self) -> [String; 2] {
-        drop(self.socket);
-        let status = self.bridge.wait().unwrap();
-        assert!(!status.success());
-        let mut texts = [String::new(), String::new()];
-        self.bridge.stdout.unwrap().read_to_string(&mut texts[0]).unwrap();
-        self.bridge.stderr.unwrap().read_to_string(&mut texts[1]).unwrap();
-        texts
+    pub(crate) fn end(self) -> [String; 2] {
+        let Self { bridge, stderr, socket } = self;
+        drop(socket);
+        ended(bridge, stderr)
+    }
+
+    /// The same when the bridge ends by itself.
+    pub(crate) fn wait(self) -> [String; 2] {
+        let Self {
+            bridge,
+            stderr,
+            socket: _open,
+        } = self;
+        ended(bridge, stderr)
     }
 }
 
-fn channel(id: u32, topic: &str, schema: &str) -> Value {
+fn ended(mut bridge: Child, mut stderr: BufReader<ChildStderr>) -> [String; 2] {
+    assert!(!bridge.wait().unwrap().success());
+    let mut texts = [String::new(), String::new()];
+    bridge.stdout.unwrap().read_to_string(&mut texts[0]).unwrap();
+    stderr.read_to_string(&mut texts[1]).unwrap();
+    texts
+}
+
+pub(crate) fn channel(id: u32, topic: &str, schema: &str) -> Value {
     json!({"id": id, "topic": topic, "encoding": "cdr", "schemaName": schema, "schema": "", "schemaEncoding": "ros2msg"})
 }
 
@@ -135,14 +207,7 @@ fn a_robot_gets_predictions_and_their_errors() {
         topics,
         ["/foreframe/predicted", "/foreframe/error", "/foreframe/expected_error"]
     );
-    let mut subscriptions = std::collections::BTreeMap::new();
-    for _ in 0..3 {
-        let asked = &robot.heard()["subscriptions"][0];
-        subscriptions.insert(
-            asked["channelId"].as_u64().unwrap(),
-            asked["id"].as_u64().unwrap() as u32,
-        );
-    }
+    let subscriptions = robot.subscriptions(3);
     assert_eq!(subscriptions.keys().copied().collect::<Vec<_>>(), [4, 5, 6]);
     let (camera, command, odom) = (subscriptions[&4], subscriptions[&5], subscriptions[&6]);
     // An image before the first action and state is not used.
@@ -154,10 +219,10 @@ fn a_robot_gets_predictions_and_their_errors() {
     // One that cannot be read is left out.
     robot.data(camera, 1, b"half an image");
     robot.data(command, 1, &twist(false, 0.5, 0.1));
-    robot.data(odom, 1, &odometry(1, 0.2, 0.0, 0.5));
     let (mut predicted, begin) = (Vec::new(), 1_000_000_000);
     for index in 0..8u64 {
         let seen = frame(20 * index as u8);
+        robot.data(odom, begin + index * PERIOD_NS, &odometry(1, 0.2, 0.0, 0.5));
         send_image(&mut robot, begin + index * PERIOD_NS, &seen);
         // The camera has three times the rate of the model.
         send_image(&mut robot, begin + index * PERIOD_NS + PERIOD_NS / 3, &frame(7));
@@ -181,6 +246,7 @@ fn a_robot_gets_predictions_and_their_errors() {
         }
     }
     // After a gap, the context begins anew, and nothing was predicted for these frames.
+    robot.data(odom, begin + 60 * PERIOD_NS, &odometry(1, 0.2, 0.0, 0.5));
     for index in 0..CONTEXT as u64 {
         send_image(
             &mut robot,
@@ -214,10 +280,7 @@ fn what_cannot_be_used_is_named() {
     let dir = tempfile::tempdir().unwrap();
     let channels = json!([channel(1, "/map", "nav_msgs/msg/OccupancyGrid")]);
     let robot = Robot::start(dir.path(), &["--image", "/map"], &["clientPublish"], &channels);
-    let mut bridge = robot.bridge;
-    assert_eq!(bridge.wait().unwrap().code(), Some(2));
-    let mut error = String::new();
-    bridge.stderr.unwrap().read_to_string(&mut error).unwrap();
+    let [_, error] = robot.wait();
     assert!(
         error.contains("/map has messages of the type \"nav_msgs/msg/OccupancyGrid\""),
         "{error}"
@@ -226,8 +289,19 @@ fn what_cannot_be_used_is_named() {
         let refused = crate::process::output(dir.path(), &["bridge", address, "--model", "./moving"]);
         assert_eq!(refused.status.code(), Some(2), "{address}");
     }
-    let silent = crate::process::output(dir.path(), &["bridge", "ws://127.0.0.1:1", "--model", "./moving"]);
+    let bridge = ["bridge", "ws://127.0.0.1:1", "--model", "./moving"];
+    let silent = crate::process::output(dir.path(), &bridge);
     assert_eq!(silent.status.code(), Some(1));
+    for (name, value, reason) in [
+        ("--image", "/foreframe/predicted", "which this bridge itself publishes"),
+        ("--idle-limit", "0", "give a number of seconds"),
+        ("--state-age-limit", "soon", "give a number of seconds"),
+    ] {
+        let refused = crate::process::output(dir.path(), &[&bridge[..], &[name, value]].concat());
+        let error = String::from_utf8_lossy(&refused.stderr);
+        assert_eq!(refused.status.code(), Some(2), "{error}");
+        assert!(error.contains(reason), "{error}");
+    }
 }
 
 #[cfg(not(feature = "tls"))]

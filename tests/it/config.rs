@@ -43,7 +43,7 @@ fn flags_override_environment_file_and_defaults() {
     ] {
         assert!(text.lines().any(|found| found == line), "{line} is not in\n{text}");
     }
-    assert!(text.contains("mine.toml; 1 to 4096"), "{text}");
+    assert!(text.contains("mine.toml; 1 to 512"), "{text}");
 }
 
 #[test]
@@ -59,12 +59,18 @@ fn the_printed_configuration_is_a_valid_file() {
     let read = LoadedConfig::from_layers([file(&printed.to_toml())]).unwrap();
     assert_eq!(read.config, printed.config);
     assert_eq!(read.config.log_format, LogFormat::Json);
+    assert_eq!(read.config.server.job_log_format, LogFormat::Json);
     assert_eq!(read.config.server.cors_origins, ["http://a"]);
 }
 
 #[test]
 fn an_origin_that_no_page_has_is_refused() {
-    for wrong in ["robots.example", "https://robots.example/page", "*"] {
+    for wrong in [
+        "robots.example",
+        "https://robots.example/page",
+        "https://user@robots.example",
+        "*",
+    ] {
         let message = refused(environment(&[("FOREFRAME_CORS_ORIGINS", &format!("[\"{wrong}\"]"))]));
         let expected = format!("cors_origins holds \"{wrong}\" (environment FOREFRAME_CORS_ORIGINS); an origin is");
         assert!(message.starts_with(&expected), "{message}");
@@ -105,11 +111,23 @@ fn invalid_settings_are_refused_with_their_source() {
         ),
         (
             set("max_streams=many"),
-            "max_streams is \"many\" (--set); it must be 1 to 1000000",
+            "max_streams is \"many\" (--set); it must be a whole number, 1 to 1000000",
         ),
         (
             set("max_streams=-1"),
-            "max_streams is -1 (--set); it must be 1 to 1000000",
+            "max_streams is -1 (--set); it must be a whole number, 1 to 1000000",
+        ),
+        (
+            set("max_streams=5.0"),
+            "max_streams is 5.0 (--set); it must be a whole number, 1 to 1000000",
+        ),
+        (
+            set("drain_ms=5s"),
+            "drain_ms is \"5s\" (--set); it must be a whole number of milliseconds, 0 to 10000",
+        ),
+        (
+            set("max_body_bytes=1MiB"),
+            "max_body_bytes is \"1MiB\" (--set); it must be a whole number of bytes, 1024 to 1073741824",
         ),
         (
             set("bind=localhost:http"),
@@ -138,6 +156,28 @@ fn invalid_settings_are_refused_with_their_source() {
         SettingsLayer::file(&dir.path().join("bad")),
         Err(SettingsError::Toml { .. })
     ));
+}
+
+#[test]
+fn variables_of_a_kubernetes_service_are_refused_with_the_remedy() {
+    for (name, value) in [
+        ("FOREFRAME_SERVICE_HOST", "10.0.0.1"),
+        ("FOREFRAME_SERVICE_PORT", "80"),
+        ("FOREFRAME_PORT", "tcp://10.0.0.1:80"),
+        ("FOREFRAME_PORT_80_TCP", "tcp://10.0.0.1:80"),
+        ("FOREFRAME_PORT_80_TCP_PROTO", "tcp"),
+        ("FOREFRAME_SERVER_SERVICE_HOST", "10.0.0.1"),
+    ] {
+        let message = refused(environment(&[(name, value)]));
+        assert!(
+            message.contains("set enableServiceLinks: false in the pod"),
+            "{message}"
+        );
+    }
+    for (name, value) in [("FOREFRAME_PORT", "80x"), ("FOREFRAME_IMPORT_DIRS", "a")] {
+        let message = refused(environment(&[(name, value)]));
+        assert!(!message.contains("enableServiceLinks"), "{message}");
+    }
 }
 
 #[test]

@@ -100,6 +100,15 @@ async fn headers_over_the_limit_are_answered_431() {
     let head = format!("GET /livez HTTP/1.1\r\nhost: a\r\nx: {}\r\n\r\n", "y".repeat(9000));
     client.write_all(head.as_bytes()).await.unwrap();
     assert!(read_to_end(&mut client).await.starts_with("HTTP/1.1 431"));
+    let many: String = (0..101).map(|number| format!("x-{number}: y\r\n")).collect();
+    let mut client = connect(server.address).await;
+    let head = format!("GET /livez HTTP/1.1\r\nhost: a\r\n{many}\r\n");
+    client.write_all(head.as_bytes()).await.unwrap();
+    let answer = read_to_end(&mut client).await;
+    assert!(
+        answer.starts_with("HTTP/1.1 431") && answer.contains("more than 100 headers"),
+        "{answer}"
+    );
     server.stop().await;
 }
 
@@ -224,7 +233,11 @@ async fn other_origins_are_refused_unless_configured() {
     let dir = tempfile::tempdir().unwrap();
     let config = ServerConfig {
         // As people write it.
-        cors_origins: vec!["https://Robots.example/".to_owned()],
+        cors_origins: vec![
+            "https://Robots.example:443/".to_owned(),
+            "http://plain.example:80".to_owned(),
+            "http://other.example:443".to_owned(),
+        ],
         ..ServerConfig::default()
     };
     let app = app(dir.path(), config);
@@ -252,16 +265,30 @@ async fn other_origins_are_refused_unless_configured() {
         named.headers[header::ACCESS_CONTROL_ALLOW_ORIGIN],
         "https://robots.example"
     );
+    let exposed = named.headers[header::ACCESS_CONTROL_EXPOSE_HEADERS].to_str().unwrap();
+    for header in ["location", "retry-after", "x-request-id"] {
+        assert!(exposed.split(", ").any(|exposed| exposed == header), "{exposed}");
+    }
+    for (origin, status) in [
+        ("http://plain.example", 200),
+        ("http://other.example:443", 200),
+        ("http://other.example", 403),
+    ] {
+        assert_eq!(send(&app, from("GET", origin)).await.status, status, "{origin}");
+    }
     let question = send(&app, from("OPTIONS", "https://robots.example")).await;
     assert_eq!(question.status, 204);
-    assert!(question.headers.contains_key(header::ACCESS_CONTROL_ALLOW_HEADERS));
+    let allowed = question.headers[header::ACCESS_CONTROL_ALLOW_HEADERS].to_str().unwrap();
+    for header in ["authorization", "last-event-id"] {
+        assert!(allowed.split(", ").any(|allowed| allowed == header), "{allowed}");
+    }
 }
 
 #[tokio::test]
 async fn without_keys_public_host_names_are_refused() {
     let dir = tempfile::tempdir().unwrap();
     let config = ServerConfig {
-        cors_origins: vec!["https://robots.example".to_owned()],
+        cors_origins: vec!["https://robots.example:443".to_owned()],
         ..ServerConfig::default()
     };
     let app = app(dir.path(), config);

@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use axum::body::Body;
 use axum::http::Request;
 use foreframe::server::{App, ServerConfig, openapi_document};
+use foreframe_core::nn::spec::MAX_STEPS;
 use serde_json::{Value, json};
 
 use crate::service::{app, get, poll_until, post, post_text, send};
@@ -103,6 +104,35 @@ fn the_committed_openapi_document_is_current() {
         "openapi/openapi.json differs from the code; update it with\n  \
          UPDATE_OPENAPI=1 cargo test --release --test it the_committed_openapi_document_is_current"
     );
+}
+
+#[test]
+fn the_openapi_document_says_limits_that_are_constants() {
+    let document: Value = serde_json::from_str(&openapi_document()).unwrap();
+    let schemas = &document["components"]["schemas"];
+    for schema in [
+        "ActionExtra",
+        "PlanSearch",
+        "PredictRequest",
+        "RolloutRequest",
+        "SessionRolloutRequest",
+        "SessionSnapshot",
+    ] {
+        let steps = &schemas[schema]["properties"]["steps"];
+        assert_eq!(
+            (&steps["minimum"], &steps["maximum"]),
+            (&json!(1), &json!(MAX_STEPS)),
+            "{schema}"
+        );
+    }
+    for schema in ["PlanRequest", "SessionPlanRequest"] {
+        assert_eq!(
+            schemas[schema]["properties"]["present"]["maxItems"], MAX_STEPS,
+            "{schema}"
+        );
+    }
+    let position = &schemas["PlanGoal"]["properties"]["position_m"];
+    assert_eq!((&position["minItems"], &position["maxItems"]), (&json!(2), &json!(2)));
 }
 
 #[tokio::test]

@@ -81,3 +81,22 @@ fn deployments_name_existing_settings() {
         assert!(is_known, "{}: there is no setting {setting}", path.display());
     }
 }
+
+/// The documents of all manifests that describe pods.
+fn pods() -> Vec<String> {
+    let manifests = files("deploy/kubernetes").into_iter();
+    let texts: Vec<String> = manifests.map(|path| std::fs::read_to_string(path).unwrap()).collect();
+    let documents = texts.iter().flat_map(|text| text.split("\n---\n"));
+    let of_pods = documents.filter(|document| document.contains("\n      containers:\n"));
+    of_pods.map(str::to_owned).collect()
+}
+
+#[test]
+fn pods_get_no_variables_of_services() {
+    let pods = pods();
+    assert_eq!(pods.len(), 2, "{pods:?}");
+    for pod in pods {
+        // In the pod's specification, beside its containers.
+        assert!(pod.contains("\n      enableServiceLinks: false\n"), "{pod}");
+    }
+}

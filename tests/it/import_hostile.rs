@@ -7,7 +7,8 @@ use foreframe_data::dataset::Dataset;
 use foreframe_data::dataset::import::{ImportOptions, Imported};
 
 use crate::bag_files::{BagMessage, image};
-use crate::import::{folder, npz, run, small};
+use crate::import::{folder, run, small};
+use crate::import_arrays::npz;
 use crate::recordings::{database, numpy_array};
 
 fn refused(source: &Path, options: ImportOptions) -> String {

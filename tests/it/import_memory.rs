@@ -9,7 +9,7 @@ use foreframe_data::dataset::import::{DEFAULT_DISK_MIB, ImportConfig, ImportErro
 use serde_json::Value;
 
 use crate::bag_files::endless_topics;
-use crate::import::npz;
+use crate::import_arrays::npz;
 use crate::process::{foreframe, text};
 use crate::recordings::{self, numpy_array};
 

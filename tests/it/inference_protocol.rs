@@ -114,6 +114,14 @@ async fn requests_that_cannot_be_used_are_refused_with_their_tensor() {
         let found = error(&answer, 422);
         assert!(found.contains(words), "{found}");
     }
+    // As many values as the shape has, in lists of another shape.
+    let columns: Vec<Vec<Vec<u8>>> = vec![vec![vec![0; CONTEXT]; WIDTH as usize]; HEIGHT as usize];
+    let answer = send_with(&app, None, head(json!({"data": columns})).to_string().into_bytes()).await;
+    let (found, expected) = ([HEIGHT, WIDTH, CONTEXT as u32], [CONTEXT as u32, HEIGHT, WIDTH]);
+    assert_eq!(
+        error(&answer, 422),
+        format!("input \"frames\" has lists of the shape {found:?}; its shape is {expected:?}")
+    );
     let mut both = head(json!({"data": pixels()}));
     let plans = json!({"name": "plans", "shape": [1, 2, 2], "datatype": "FP32", "data": [0, 0, 0, 0]});
     both["inputs"].as_array_mut().unwrap().push(plans);

@@ -439,6 +439,16 @@ async fn data_sets_are_described_shown_and_deleted() {
             .starts_with("default-src 'none'")
     );
 
+    // Imported again with another frame period: the same content, but another animation.
+    let metadata = dir.path().join("datasets/seen/meta/foreframe.json");
+    let before = std::fs::read_to_string(&metadata).unwrap();
+    let mut described: Value = serde_json::from_str(&before).unwrap();
+    described["frame_period_s"] = json!(1.0);
+    std::fs::write(&metadata, described.to_string()).unwrap();
+    assert_ne!(picture("0/preview.gif").await.body, first.body);
+    std::fs::write(&metadata, before).unwrap();
+    assert_eq!(picture("0/preview.gif").await.body, first.body);
+
     let mut long = train("slow", 100_000);
     long["settings"]["run"] = json!({});
     post(&app, JOBS, &long).await;

@@ -28,7 +28,7 @@ fn metric(server: &RunningServer, series: &str) -> Option<f64> {
 
 /// Waits for a value: some events are counted only after they are answered, so that no client waits for the metrics.
 #[track_caller]
-fn wait_for_metric(server: &RunningServer, series: &str, value: f64) {
+pub(crate) fn wait_for_metric(server: &RunningServer, series: &str, value: f64) {
     let deadline = Instant::now() + TIMEOUT;
     while metric(server, series) != Some(value) {
         let found = metric(server, series);

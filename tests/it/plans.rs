@@ -214,7 +214,7 @@ fn slow(dir: &std::path::Path) -> Model {
 async fn the_budget_is_kept_and_the_answer_is_to_stop_if_nothing_was_judged() {
     let dir = tempfile::tempdir().unwrap();
     let config = ServerConfig {
-        max_batch: 2048,
+        max_batch: 512,
         ..ServerConfig::default()
     };
     let app = start(with_data(dir.path(), config), vec![slow(dir.path())]);

@@ -59,12 +59,26 @@ fn a_report_names_a_precision_of_fewer_bits() {
 fn a_precision_without_instructions_is_refused_with_those_that_work() {
     let dir = tempfile::tempdir().unwrap();
     for precision in Precision::ALL.into_iter().filter(|precision| !precision.is_supported()) {
-        let refused = output(dir.path(), &["serve", "--set", &format!("precision={precision}")]);
+        for command in ["serve", "config"] {
+            let refused = output(dir.path(), &[command, "--set", &format!("precision={precision}")]);
+            let error = text(&refused.stderr);
+            assert_eq!(refused.status.code(), Some(2), "{error}");
+            assert!(
+                error.contains("this processor has no ") && error.contains("it predicts in \"f32\""),
+                "{error}"
+            );
+        }
+    }
+}
+
+#[test]
+fn a_device_that_serve_refuses_is_not_printed_as_a_setting() {
+    let dir = tempfile::tempdir().unwrap();
+    // No machine has so many graphics cards.
+    let refused = ["serve", "config"].map(|command| output(dir.path(), &[command, "--set", "device=cuda:999"]));
+    for refused in &refused {
         let error = text(&refused.stderr);
         assert_eq!(refused.status.code(), Some(2), "{error}");
-        assert!(
-            error.contains("this processor has no ") && error.contains("it predicts in \"f32\""),
-            "{error}"
-        );
+        assert!(error.contains("device is \"cuda:999\" (--set): "), "{error}");
     }
 }

@@ -281,7 +281,7 @@ fn the_configuration_is_printed_with_its_sources() {
     for line in [
         "# Maximum number of streams; more are refused with 503.",
         "max_streams = 7  # foreframe.toml; 1 to 1000000",
-        "max_batch = 9  # environment FOREFRAME_MAX_BATCH; 1 to 4096",
+        "max_batch = 9  # environment FOREFRAME_MAX_BATCH; 1 to 512",
         "data_dir = \"here\"  # --data-dir",
     ] {
         assert!(

@@ -1,6 +1,7 @@
 //! Predictions over HTTP: responses, refusals, limits and shutdown.
 
-use axum::http::header;
+use axum::body::Body;
+use axum::http::{Request, header};
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use foreframe::server::ServerConfig;
@@ -12,7 +13,7 @@ use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::TcpStream;
 
 use crate::service::{
-    CONTEXT, HEIGHT, HORIZON, WIDTH, app, context, frame, get, model, png, post, post_text, run, slow_spec, spec,
+    CONTEXT, HEIGHT, HORIZON, WIDTH, app, context, frame, get, model, png, post, post_text, run, send, slow_spec, spec,
     start, with_data,
 };
 
@@ -191,9 +192,26 @@ async fn bodies_and_lists_over_their_limit_are_refused() {
     let long = post(&app, PLAIN, &json!({"frames": ["A".repeat(5000)]}))
         .await
         .detail(413);
-    assert_eq!(long, "the body is longer than this server takes");
+    let expected = "the body is longer than this server takes (settings max_body_bytes and, for jobs, max_job_bytes)";
+    assert_eq!(long, expected);
     let many = post(&app, PLAIN, &json!({"frames": vec!["AAAA"; 5]})).await.detail(413);
     assert_eq!(many, "frames holds 5; this server takes at most 4 in a request");
+}
+
+#[tokio::test]
+async fn a_body_that_alone_exceeds_what_is_read_at_a_time_is_too_long() {
+    let dir = tempfile::tempdir().unwrap();
+    let config = ServerConfig {
+        max_body_bytes: 4096,
+        max_total_body_bytes: 4096,
+        ..ServerConfig::default()
+    };
+    let app = app(dir.path(), config);
+    let pieces = (0..8).map(|_| Ok::<_, std::io::Error>(vec![b' '; 1000]));
+    let body = Body::from_stream(futures_util::stream::iter(pieces));
+    let request = Request::post(PLAIN).header(header::CONTENT_TYPE, "application/json");
+    let detail = send(&app, request.body(body).unwrap()).await.detail(413);
+    assert!(detail.contains("max_body_bytes"), "{detail}");
 }
 
 #[tokio::test]
@@ -230,8 +248,8 @@ async fn a_prediction_past_its_deadline_is_answered_503() {
     let body = json!({"frames": context()});
     let asked = (0..20).map(|_| post(&app, "/v1/models/slow/predict", &body));
     let answers = futures_util::future::join_all(asked).await;
-    let late = answers.iter().find(|answer| answer.status != 200).unwrap();
-    assert_eq!(late.detail(503), "no prediction within 1 ms; the server is overloaded");
+    let late = answers.iter().find(|answer| answer.status == 503).unwrap();
+    assert!(late.detail(503).starts_with("no prediction within 1 ms (setting prediction_deadline_ms)"));
     assert_eq!(late.headers[header::RETRY_AFTER], "1");
 }
 

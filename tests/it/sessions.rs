@@ -5,11 +5,11 @@ use std::time::Duration;
 use axum::body::Body;
 use axum::http::Request;
 use foreframe::server::ServerConfig;
-use foreframe::server::protocol::{ClosingReason, Codec, ErrorCode, ServerMessage};
+use foreframe::server::protocol::{ClientMessage, ClosingReason, Codec, ErrorCode, ServerMessage};
 use serde_json::{Value, json};
 use tokio_tungstenite::tungstenite::Error;
 
-use crate::client::{Client, SessionHandle, numbered_message};
+use crate::client::{Client, SessionHandle, numbered_frame, numbered_message};
 use crate::service::{CONTEXT, app, get, poll_until, post, run, send};
 
 const MOVING: &str = r#"{"model": "moving"}"#;
@@ -290,5 +290,27 @@ async fn an_invalid_state_is_refused_with_the_field() {
     assert!(found.contains("the state is of \"moving\""), "{found}");
     let found = post(&app, "/v1/sessions", &json!({})).await.detail(422);
     assert!(found.starts_with("model is missing"), "{found}");
+    server.stop().await;
+}
+
+#[tokio::test]
+async fn a_session_says_once_that_its_camera_is_not_used() {
+    let dir = tempfile::tempdir().unwrap();
+    let app = app(dir.path(), ServerConfig::default());
+    let camera = json!({"horizontal_fov_rad": 1.0, "tilt_down_rad": 0.1});
+    let opened = SessionHandle::open(&app, &json!({"model": "plain", "camera": camera})).await;
+    let server = run(app).await;
+    let path = opened.path("/stream");
+    let mut client = Client::connect(server.address, &path, Codec::Json).await.unwrap();
+    let mut said = Vec::new();
+    for seq in 0..CONTEXT as u64 + 2 {
+        let mut frame = numbered_frame(seq);
+        (frame.action, frame.state) = (None, None);
+        if let ServerMessage::Prediction { warnings, .. } = client.ask(&ClientMessage::Frame(frame)).await {
+            said.push(warnings);
+        }
+    }
+    let expected = "camera is not used: the model \"plain\" does not estimate depth".to_owned();
+    assert_eq!(said, [vec![expected], Vec::new(), Vec::new()]);
     server.stop().await;
 }

@@ -15,7 +15,7 @@ const JOBS: &str = "/v1/jobs";
 const SET: &str = "/v1/datasets/d";
 
 /// A server with its own data directory and no shipped models.
-async fn machine(objects: &Path) -> (TempDir, App) {
+pub(crate) async fn machine(objects: &Path) -> (TempDir, App) {
     let dir = tempfile::tempdir().unwrap();
     let models_dir = dir.path().join("none-shipped");
     std::fs::create_dir_all(&models_dir).unwrap();

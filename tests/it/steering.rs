@@ -96,7 +96,7 @@ fn a_plan_that_cannot_be_made_says_why() {
         (format!("plan --model rooms {LOOK} --goal 1"), "two numbers are needed"),
         (
             format!("plan --model rooms {LOOK} --goal 1,0 --solver best"),
-            "it is random-shooting, cem or mppi",
+            "there are: random-shooting, cem, mppi",
         ),
         (
             format!("plan --model rooms {LOOK} --goal 1,0 --at 2"),

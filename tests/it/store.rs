@@ -554,19 +554,43 @@ async fn a_submitter_without_running_jobs_is_first() {
     }
 }
 
+fn key(id: &str, scope: KeyScope) -> KeyRow {
+    KeyRow {
+        id: id.to_owned(),
+        name: id.to_owned(),
+        hash: id.to_owned(),
+        created_s: 1.0,
+        revoked_s: None,
+        scope,
+        expires_s: None,
+        requests_per_s: None,
+    }
+}
+
+#[tokio::test]
+async fn of_servers_that_start_at_once_one_makes_the_first_key() {
+    for (_dir, store) in stores("first-key").await {
+        let add = async |id| {
+            let added = store
+                .add_first_key(key(id, KeyScope::Admin), &Author::CommandLine)
+                .await;
+            added.unwrap()
+        };
+        let added = futures_util::future::join3(add("a"), add("b"), add("c")).await;
+        assert_eq!(
+            [added.0, added.1, added.2].into_iter().filter(|&first| first).count(),
+            1
+        );
+        let keys = store.list_keys().await.unwrap();
+        assert_eq!(keys.len(), 1);
+        store.revoke_key(&keys[0].id, 1.0, &Author::CommandLine).await.unwrap();
+        assert!(!add("d").await);
+    }
+}
+
 #[tokio::test]
 async fn a_key_has_its_share_of_the_job_queue() {
     for (_dir, store) in stores("share").await {
-        let key = |id: &str, scope| KeyRow {
-            id: id.to_owned(),
-            name: id.to_owned(),
-            hash: id.to_owned(),
-            created_s: 1.0,
-            revoked_s: None,
-            scope,
-            expires_s: None,
-            requests_per_s: None,
-        };
         for (id, scope) in [
             ("a", KeyScope::Jobs),
             ("b", KeyScope::Admin),

@@ -10,6 +10,7 @@ use std::time::{Duration, Instant};
 
 use serde_json::{Value, json};
 
+use crate::metrics::wait_for_metric;
 use crate::process::{RunningServer, output, text};
 use crate::service::TIMEOUT;
 use crate::skip::skip_without;
@@ -132,6 +133,9 @@ pub(crate) fn status(answer: &str) -> &str {
     answer.split(' ').nth(1).unwrap_or_default()
 }
 
+/// Whether the server can write its store, as its metrics tell.
+pub(crate) const WRITABLE: &str = "foreframe_store_writable";
+
 pub(crate) fn wait_for_status(server: &RunningServer, path: &str, expected: &str) -> String {
     let deadline = Instant::now() + TIMEOUT;
     loop {
@@ -172,18 +176,21 @@ fn a_server_survives_a_database_that_goes_away() {
     assert!(refused.to_lowercase().contains("\r\nretry-after: "), "{refused}");
     assert_eq!(server.ask("POST", "/v1/jobs", &collect("meanwhile"))["status"], 503);
     assert_eq!(status(&server.get("/livez")), "200");
-    wait_for_status(&server, "/readyz", "503");
+    wait_for_metric(&server, WRITABLE, 0.0);
+    // Load balancers send it predictions, which need no database.
+    assert_eq!(status(&server.get("/readyz")), "200");
     postgres.start();
-    wait_for_status(&server, "/readyz", "200");
+    wait_for_metric(&server, WRITABLE, 1.0);
     assert_eq!(server.ask("POST", "/v1/jobs", &collect("after"))["id"], "job-2");
 
     postgres.signal("-STOP");
-    wait_for_status(&server, "/readyz", "503");
+    wait_for_metric(&server, WRITABLE, 0.0);
+    assert_eq!(status(&server.get("/readyz")), "200");
     let refused = wait_for_status(&server, "/v1/jobs", "503");
     assert!(refused.contains("no answer was ready within 5000 ms"), "{refused}");
     assert_eq!(status(&server.get("/livez")), "200");
     postgres.signal("-CONT");
-    wait_for_status(&server, "/readyz", "200");
+    wait_for_metric(&server, WRITABLE, 1.0);
     let jobs = server.ask("GET", "/v1/jobs", &Value::Null);
     let names: Vec<_> = jobs["jobs"]
         .as_array()
@@ -273,23 +280,29 @@ fn a_server_gives_up_on_a_database_that_does_not_come() {
 fn a_job_waits_for_its_object_store() {
     let (dir, shared) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
     let url = shared.path().display().to_string();
-    let server = RunningServer::start(dir.path(), &["--objects-url", &url]);
+    let server = RunningServer::start(dir.path(), &["--objects-url", &url, "--log-format", "json"]);
     assert_eq!(server.ask("POST", "/v1/jobs", &collect("seen"))["id"], "job-1");
     server.wait_for_job("job-1", |job| job["state"] == "running");
     // Nothing can be written below a file.
     let obstacle = shared.path().join("datasets");
     std::fs::write(&obstacle, "").unwrap();
-    let deadline = Instant::now() + TIMEOUT;
-    while !server
-        .get("/v1/jobs/job-1/logs")
-        .contains("waiting for the store: could not")
-    {
-        let job = server.wait_for_job("job-1", |_| true);
-        assert!(job["state"] == "running" && Instant::now() < deadline, "{job}");
-        std::thread::sleep(Duration::from_millis(50));
-    }
+    let waits = |job: &Value| {
+        let message = job["progress"]["message"].as_str().unwrap_or_default();
+        message.starts_with("waiting for the store: could not")
+    };
+    let job = server.wait_for_job("job-1", waits);
+    assert_eq!(job["state"], "running", "{job}");
+    let log = server.get("/v1/jobs/job-1/logs");
+    assert!(log.contains("waiting for the store: could not"), "{log}");
     std::fs::remove_file(obstacle).unwrap();
     let job = server.wait_for_job("job-1", |job| job["state"] == "succeeded");
-    assert_eq!(job["attempts"], 1);
+    assert!(job["attempts"] == 1 && !waits(&job), "{job}");
     assert!(shared.path().join("datasets/seen/meta/info.json").is_file());
+    server.terminate();
+    let log = server.wait_for_exit();
+    // The job's process writes it.
+    assert!(log.contains("a job waits for the store"), "{log}");
+    for line in log.lines() {
+        assert!(serde_json::from_str::<Value>(line).is_ok(), "not JSON: {line}");
+    }
 }

@@ -11,10 +11,11 @@ use serde_json::{Value, json};
 
 use crate::jobs_killed::{copy_dataset, weights};
 use crate::jobs_outage::{training, undisturbed};
+use crate::metrics::wait_for_metric;
 use crate::process::{RunningServer, foreframe, output, text};
 use crate::recordings;
 use crate::service::{context, model, spec};
-use crate::store_away::{status, wait_for_status};
+use crate::store_away::{WRITABLE, status};
 
 const EIO: u32 = 5;
 const EROFS: u32 = 30;
@@ -106,7 +107,8 @@ fn recovers_from(number: u32, library: &Path, whole: &Path) {
     server.wait_for_job("job-1", |job| job["progress"]["done"].as_u64() > Some(0));
 
     failing.fail_with(number);
-    wait_for_status(server, "/readyz", "503");
+    wait_for_metric(server, WRITABLE, 0.0);
+    assert_eq!(status(&server.get("/readyz")), "200");
     let refused = server.send("POST", "/v1/jobs", &collect("refused").to_string());
     assert_eq!(status(&refused), "503", "{refused}");
     assert!(refused.to_lowercase().contains("\r\nretry-after: "), "{refused}");
@@ -121,7 +123,7 @@ fn recovers_from(number: u32, library: &Path, whole: &Path) {
     std::thread::sleep(Duration::from_secs(3));
     failing.mend();
 
-    wait_for_status(server, "/readyz", "200");
+    wait_for_metric(server, WRITABLE, 1.0);
     // On every connection to the database, also on those that were opened meanwhile.
     let jobs = all_at_once(|index| server.ask("POST", "/v1/jobs", &collect(&format!("after-{index}"))));
     for job in &jobs {

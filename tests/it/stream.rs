@@ -99,6 +99,37 @@ async fn a_stream_predicts_the_same_as_a_request() {
 }
 
 #[tokio::test]
+async fn a_stream_says_once_which_inputs_are_not_used() {
+    let dir = tempfile::tempdir().unwrap();
+    let server = run(app(dir.path(), ServerConfig::default())).await;
+    for (model, expected) in [
+        (
+            "plain",
+            json!([
+                "action is not used: the model \"plain\" takes no actions",
+                "plan is not used: the model \"plain\" takes no actions"
+            ]),
+        ),
+        ("moving", Value::Null),
+    ] {
+        let mut socket = open(&server, model).await;
+        let mut warnings = Vec::new();
+        for seq in 0..CONTEXT as u64 + 2 {
+            let mut message = frame_message(seq);
+            message["action"] = json!([0.5, -0.5]);
+            message["plan"] = json!([[0.5, -0.5], [0.5, -0.5]]);
+            message["state"] = json!([0.5]);
+            let answer = ask(&mut socket, message).await;
+            if answer["type"] == "prediction" {
+                warnings.push(answer["warnings"].clone());
+            }
+        }
+        assert_eq!(warnings, [expected, Value::Null, Value::Null], "{model}");
+    }
+    server.stop().await;
+}
+
+#[tokio::test]
 async fn without_a_plan_the_last_action_repeats() {
     let dir = tempfile::tempdir().unwrap();
     let server = run(app(dir.path(), ServerConfig::default())).await;

@@ -14,7 +14,7 @@ use foreframe_train::training::{TrainConfig, TrainError, Training, TrainingEvent
 
 use crate::fixtures::moving_squares;
 
-fn squares(episodes: usize) -> Dataset {
+pub(crate) fn squares(episodes: usize) -> Dataset {
     moving_squares(episodes, 12, 0.2)
 }
 
@@ -146,7 +146,7 @@ fn settings_that_do_not_fit_the_network_or_the_camera_are_refused() {
     );
 }
 
-fn small_config(extra: &[&str]) -> TrainConfig {
+pub(crate) fn small_config(extra: &[&str]) -> TrainConfig {
     let small = [
         "name=square",
         "model.features=8",
@@ -171,7 +171,7 @@ pub(crate) fn train(config: &TrainConfig, dataset: &Dataset, dir: &Path) -> Resu
 }
 
 /// Trains until this call has made `updates` updates.
-fn train_until(
+pub(crate) fn train_until(
     config: &TrainConfig,
     dataset: &Dataset,
     dir: &Path,

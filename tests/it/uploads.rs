@@ -5,13 +5,16 @@ use std::io::Write as _;
 use std::path::Path;
 
 use axum::body::{Body, Bytes};
-use axum::http::{Request, header};
+use axum::http::{Request, StatusCode, header};
+use foreframe::server::keys::Keys;
 use foreframe::server::{App, ServerConfig};
 use futures_util::stream;
 use serde_json::{Value, json};
 
 use crate::import::folder;
-use crate::service::{Answer, app, get, poll_until, post, send};
+use crate::keys::new_key;
+use crate::service::{Answer, app, get, poll_until, post, send, store};
+use crate::shared_datasets::machine;
 
 async fn upload(app: &App, name: &str, body: impl Into<Body>) -> Answer {
     let request = Request::post(format!("/v1/uploads?name={name}"));
@@ -160,6 +163,44 @@ async fn uploads_are_bounded_in_size_and_number() {
 }
 
 #[tokio::test]
+async fn a_key_gets_its_share_of_the_places_for_uploads() {
+    let dir = tempfile::tempdir().unwrap();
+    let config = ServerConfig {
+        max_uploads: 3,
+        max_uploads_per_key: 2,
+        ..ServerConfig::default()
+    };
+    let store = store(dir.path());
+    let keys = Keys::open(store.clone(), true).await.unwrap();
+    let app = app(dir.path(), config).with_keys(keys.clone());
+    let (first, second) = (new_key(&store, &keys).await.text, new_key(&store, &keys).await.text);
+    let with = async |key: &str, method: &str, path: &str| {
+        let request = Request::builder().method(method).uri(path);
+        let request = request.header(header::AUTHORIZATION, format!("Bearer {key}"));
+        send(&app, request.body(Body::from("x")).unwrap()).await
+    };
+    let upload = async |key: &str| with(key, "POST", "/v1/uploads?name=a.npy").await;
+    let sent = upload(&first).await;
+    assert_eq!(
+        (sent.status, upload(&first).await.status),
+        (StatusCode::CREATED, StatusCode::CREATED)
+    );
+    let refused = upload(&first).await;
+    let detail = refused.detail(429);
+    assert!(
+        detail.contains("2 uploads of this API key wait") && detail.contains("max_uploads_per_key"),
+        "{detail}"
+    );
+    assert!(refused.headers.contains_key(header::RETRY_AFTER));
+    assert_eq!(upload(&second).await.status, 201);
+    upload(&second).await.detail(503);
+    // A place that is free again counts no more.
+    let deleted = format!("/v1/uploads/{}", sent.json()["id"].as_str().unwrap());
+    assert_eq!(with(&first, "DELETE", &deleted).await.status, 204);
+    assert_eq!(upload(&first).await.status, 201);
+}
+
+#[tokio::test]
 async fn an_upload_can_be_deleted_unless_a_job_imports_it() {
     let dir = tempfile::tempdir().unwrap();
     let config = ServerConfig {
@@ -188,6 +229,21 @@ async fn an_upload_can_be_deleted_unless_a_job_imports_it() {
     for unknown in [id, "..", "%2e%2e"] {
         delete(unknown).await.detail(404);
     }
+}
+
+#[tokio::test]
+async fn an_upload_that_was_deleted_through_another_server_is_not_imported() {
+    let objects = tempfile::tempdir().unwrap();
+    let (here, one) = machine(objects.path()).await;
+    let (_there, other) = machine(objects.path()).await;
+    let sent = upload(&one, "a.npy", vec![7]).await.json();
+    let id = sent["id"].as_str().unwrap();
+    let request = Request::delete(format!("/v1/uploads/{id}")).body(Body::empty());
+    assert_eq!(send(&other, request.unwrap()).await.status, 204);
+    let job = json!({"kind": "import", "name": "a", "source": sent["source"], "rate": 5});
+    let detail = post(&one, "/v1/jobs", &job).await.detail(422);
+    assert!(detail.contains("there is no"), "{detail}");
+    assert!(!here.path().join("uploads").join(id).exists());
 }
 
 #[tokio::test]

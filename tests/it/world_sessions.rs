@@ -19,7 +19,10 @@ async fn open(app: &App) -> String {
         (200, &json!("world_model_env"))
     );
     let id = opened.json()["session_id"].as_str().unwrap().to_owned();
-    format!("{SESSIONS}/{id}")
+    let session = format!("{SESSIONS}/{id}");
+    // Load balancers learn from it where the session is.
+    assert_eq!(opened.headers["location"], session.as_str());
+    session
 }
 
 /// Step of that number: the frame of that number, in the model's size.
@@ -214,4 +217,18 @@ async fn sessions_are_bounded_and_belong_to_their_key() {
         (404, &json!("session_not_found"))
     );
     assert_eq!(ask(&maker.text, &path, step_body(0)).await.status, 200);
+}
+
+#[tokio::test]
+async fn a_step_that_cannot_be_computed_now_says_why_and_when_to_try_again() {
+    let dir = tempfile::tempdir().unwrap();
+    let app = app(dir.path(), ServerConfig::default());
+    let session = open(&app).await;
+    app.predictor().stop();
+    let refused = step(&app, &session, &step_body(0)).await;
+    assert_eq!(
+        (refused.status.as_u16(), &refused.json()["error"]["message"]),
+        (503, &json!("the predictor has stopped"))
+    );
+    assert_eq!(refused.headers["retry-after"], "1");
 }

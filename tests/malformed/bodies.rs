@@ -164,5 +164,9 @@ fn a_job_over_the_size_limit_is_refused() {
     let settings: Value = (0..limit / 8).map(|number| (format!("s{number}"), json!(0))).collect();
     let asked = json!({"kind": "train", "name": "a", "preset": "paper", "dataset": "none", "settings": settings});
     let answer = SERVICE.json("a long job", "/v1/jobs", asked.to_string().into());
-    assert_eq!(answer.detail(413), "the body is longer than this server takes");
+    let detail = answer.detail(413);
+    assert!(
+        detail.starts_with("the body is longer than this server takes"),
+        "{detail}"
+    );
 }

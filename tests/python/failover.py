@@ -4,6 +4,7 @@
 
 Starts deploy/local/run, drives the streams with the Python package, kills servers (`kill -9`) and restarts them gently (SIGTERM).
 Each prediction must be that of one unbroken stream (within one gray level), and no frame may be lost. Prints how long frames took.
+Before that, all requests to a session or an environment must reach the server that has it.
 """
 
 import argparse
@@ -16,6 +17,7 @@ import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import httpx
 import numpy as np
 from PIL import Image
 
@@ -113,11 +115,28 @@ async def fail(directory: Path, kills: int, rolls: int, seconds: float) -> None:
     await asyncio.sleep(seconds)
 
 
+async def check_affinity(model: str, drive: Drive, count: int = 8) -> None:
+    """Opens what lives on one server, and asks for each of them. Half of them would be missed by chance."""
+    observation = {"images": {"front": drive.frames[0].tolist()}, "state": drive.states[0].tolist()}
+    step = {"step_id": 0, "observation": observation, "action": {"joint_positions": drive.actions[0].tolist()}}
+    async with httpx.AsyncClient(base_url=f"http://127.0.0.1:{PORT}") as client:
+        for opened, with_model, verb, path, body in [
+            ("/v1/sessions", {"model": model}, "GET", "", None),
+            ("/v1/environments", {"scenario": "static-observer"}, "POST", "/reset", {}),
+            ("/v1/realtime/sessions", {"model": model}, "POST", "/step", step),
+        ]:
+            places = [(await client.post(opened, json=with_model)).headers["location"] for _ in range(count)]
+            for place in places:
+                answer = await client.request(verb, place + path, json=body)
+                assert answer.status_code == 200, f"{place + path}: {answer.text}"
+
+
 async def drive_all(arguments: argparse.Namespace) -> None:
     drive, directory = Drive.example(), Path(arguments.dir)
     await until_ready(PORT + 1)
     await until_ready(PORT + 3)
     await until_ready(PORT)
+    await check_affinity(arguments.model, drive)
     async with foreframe.AsyncClient(f"http://127.0.0.1:{PORT}") as client:
         expected = await unbroken(client, arguments.model, drive, 2 * len(drive.frames))
         is_over, period_s = asyncio.Event(), 1.0 / arguments.hz

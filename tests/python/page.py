@@ -105,8 +105,8 @@ class Browser:
         self.executable = executable
         self.chromium = playwright.chromium.launch(executable_path=executable, args=["--no-sandbox"])
 
-    def open(self, hash="", width=1280, dark=False):
-        context = self.chromium.new_context(viewport={"width": width, "height": 900}, color_scheme="dark" if dark else "light")
+    def open(self, hash="", width=1280, dark=False, height=900):
+        context = self.chromium.new_context(viewport={"width": width, "height": height}, color_scheme="dark" if dark else "light")
         page = context.new_page()
         page.on("pageerror", lambda error: self.errors.append(f"{hash}: {error}"))
         page.on("console", lambda message: self.refused(hash, message))
@@ -149,6 +149,48 @@ def keys_and_touch_drive(browser, server):
     page.mouse.down()
     wait_until(lambda: "angular 0.90 rad/s" in page.locator(".play").inner_text(), "the button drives")
     page.mouse.up()
+    page.context.close()
+
+
+def pictures_stay_in_sight_of_who_drives_on_a_phone(browser, server):
+    for width, height in [(390, 560), (844, 390)]:
+        for view, pictures in [("play", ".play > .three"), ("dream", ".dream .two")]:
+            page = browser.open(view, width=width, height=height)
+            wait_for_pictures(page, 1)
+            page.get_by_role("button", name="drive back").evaluate("button => button.scrollIntoView({ block: 'end' })")
+            header, shown = page.locator("header").bounding_box(), page.locator(pictures).bounding_box()
+            ahead, back = (page.get_by_role("button", name=f"drive {way}").bounding_box() for way in ["ahead", "back"])
+            facts = view, width, header, shown, ahead, back
+            assert shown["y"] >= max(0, header["y"] + header["height"] - 1) and shown["y"] + shown["height"] <= height, facts
+            assert ahead["y"] >= shown["y"] + shown["height"] or ahead["x"] >= shown["x"] + shown["width"], facts
+            assert back["y"] + back["height"] <= height + 1, facts
+            page.context.close()
+
+
+def a_plot_leaves_out_a_pause(browser, server):
+    page = browser.open("play")
+    wait_for_verdict(page)
+    # The labels of the time axis, which are drawn on a canvas.
+    page.evaluate("""() => {
+      const draw = CanvasRenderingContext2D.prototype.fillText;
+      CanvasRenderingContext2D.prototype.fillText = function (text, ...place) { window.drawn.push(text); return draw.call(this, text, ...place); };
+    }""")
+
+    def oldest_s():
+        page.evaluate("window.drawn = []")
+        labels = lambda: [float(label) for label in page.evaluate("window.drawn") if re.fullmatch(r"-[0-9.]+", label)]
+        wait_until(labels, "a drawn plot")
+        return min(labels())
+
+    hide = "value => { Object.defineProperty(document, 'hidden', { value, configurable: true }); document.dispatchEvent(new Event('visibilitychange')); }"
+    before_s, started = oldest_s(), time.monotonic()
+    page.evaluate(hide, True)
+    time.sleep(12)
+    page.evaluate(hide, False)
+    time.sleep(2)
+    shown_s = time.monotonic() - started - 12
+    after_s = oldest_s()
+    assert after_s > before_s - shown_s - 5, (before_s, shown_s, after_s)
     page.context.close()
 
 
@@ -263,15 +305,27 @@ def a_dropped_file_is_imported(browser, server):
     job("my-walk").get_by_role("link", name="open it").click(timeout=60_000)
     assert "set=my-walk" in page.evaluate("location.hash")
     wait_for_pictures(page, 1)
+    # What it lacks is not asked of it.
+    page.goto(f"{server.address}/#train")
+    page.locator("form", has_text="New training").get_by_label("Data set").select_option("my-walk")
+    expect(page.locator("form", has_text="New training")).to_contain_text("no actions, so model.conditioning=none is set. ")
+    expect(page.locator(".estimate")).to_contain_text("Memory: at least", timeout=20_000)
     # The second import of that name is refused, and its upload can be imported under another name.
     page.goto(f"{server.address}/#data")
     page.locator("form.drop input[type=file]").set_input_files({"name": "my walk.zip", "mimeType": "application/zip", "buffer": walk()})
     expect(page.get_by_text("data set \"my-walk\" exists")).to_be_visible(timeout=20_000)
     assert page.locator("form.drop input[name=source]").input_value().startswith("upload:")
     page.locator("form.drop input[name=name]").fill("another-walk")
+    page.get_by_label("Keep every Nth frame").fill("2")
+    page.get_by_text("Camera and damage").click()
+    page.get_by_label("Field of view").fill("90")
+    page.get_by_label("Looks down by").fill("12")
     page.get_by_role("button", name="Import", exact=True).click()
     job("another-walk").get_by_role("link", name="open it").click(timeout=60_000)
     assert "set=another-walk" in page.evaluate("location.hash")
+    found = next(one for one in server.get("/v1/datasets")["datasets"] if one["name"] == "another-walk")
+    assert (found["frame_period_s"], found["frames"]) == (0.4, 15), found
+    assert found["camera"] and abs(found["camera"]["tilt_down_rad"] - 0.2094) < 1e-3, found
     page.on("dialog", lambda dialog: dialog.accept())
     page.get_by_role("button", name="Delete this data set").click()
     expect(page.locator("a.card", has_text="my-walk")).to_have_count(1)
@@ -299,6 +353,7 @@ def a_training_is_watched(browser, server):
     page.locator(".watched").get_by_role("button", name="Cancel").click()
     expect(state).to_have_text("cancelled", timeout=60_000)
     page.locator(".watched").get_by_role("button", name="Resume").click()
+    expect(page.locator(".jobs tr.chosen")).to_contain_text("(2 attempts, with pauses)", timeout=60_000)
     wait_until(lambda: page.locator(".watched .plot canvas").count() == 1, "losses", 120)
     width = lambda: page.evaluate("document.querySelector('.sample img')?.naturalWidth")
     wait_until(lambda: width() == 5 * 64 + 4 * 2, "a sample prediction", 120)
@@ -322,6 +377,7 @@ def a_new_version_is_activated_and_evaluated(browser, server):
     evaluation = server.post("/v1/jobs", {"kind": "evaluate", "model": "small", "dataset": "room", "windows": 10})["id"]
     expect(card).not_to_contain_text("skill not measured", timeout=240_000)
     page.locator(".jobs a", has_text=evaluation).click()
+    expect(page.locator(".watched h2").first).to_contain_text("evaluate small version 2 on room")
     expect(page.locator(".report h2 code").first).to_have_text("small")
     with page.expect_download() as download:
         page.get_by_role("button", name="download the report").click()
@@ -434,7 +490,7 @@ def main():
     collect = {"kind": "collect", "name": "room", "scenario": "moving-observer", "trials": 40, "seed": 11}
     job = server.post("/v1/jobs", collect)["id"]
     wait_until(lambda: (server.get(f"/v1/jobs/{job}") or {}).get("state") == "succeeded", "a data set", 240)
-    tests = [opens_on_the_best_drivable_model, a_model_of_rooms_is_driven_in_varied_rooms, keys_and_touch_drive, survives_restarts, a_dream_goes_on_and_is_saved, a_plan_is_chosen_and_taken]
+    tests = [opens_on_the_best_drivable_model, pictures_stay_in_sight_of_who_drives_on_a_phone, a_plot_leaves_out_a_pause, a_model_of_rooms_is_driven_in_varied_rooms, keys_and_touch_drive, survives_restarts, a_dream_goes_on_and_is_saved, a_plan_is_chosen_and_taken]
     tests += [an_episode_is_played, a_dropped_file_is_imported, it_is_small, it_takes_little_of_the_cpu, it_rests_when_hidden, a_training_is_watched, a_new_version_is_activated_and_evaluated]
     only = os.environ.get("PAGE_TEST")
     try:

@@ -73,6 +73,8 @@ names! {
     describe_counter STREAM_DROPPED = "foreframe_stream_predictions_dropped_total" in Count:
         "Predictions that were computed but not sent, because the client read too slowly.";
 
+    describe_gauge STORE_WRITABLE = "foreframe_store_writable" in Count:
+        "1 if the database and the data directory could be written within the last second, otherwise 0.";
     describe_gauge JOBS = "foreframe_jobs" in Count:
         "Jobs in the store, of all servers and workers, by kind and state.";
     describe_counter JOBS_ENDED = "foreframe_jobs_ended_total" in Count:

@@ -29,6 +29,6 @@ pub use local::{Session, compute_task, predict};
 pub use prediction::{Prediction, Rollout, Timing};
 pub use predictor::{Predictor, PredictorConfig};
 pub use session::{SessionSnapshot, SessionState};
-pub use task::{Features, Task, check_size};
+pub use task::{Features, Task, check_size, unused_inputs};
 #[cfg(test)]
 pub(crate) use test_models::{test_depth_model, test_flow_model, test_model, test_speed_model};

@@ -1,5 +1,6 @@
 //! Values that every module uses: seeds, names, actions, states and channels. They are validated once, when they are made.
 
+mod named_enum;
 mod names;
 
 use std::fmt;

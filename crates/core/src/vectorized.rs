@@ -62,11 +62,12 @@ impl<R, F: FnOnce(Instructions) -> R> WithSimd for Loop<F> {
     }
 }
 
+/// 1.5 · 2^23: after adding it, the low bits hold the nearest whole number.
+pub(crate) const ROUND: f32 = 12_582_912.0;
+
 /// The whole part of a value from 0 to 2^22; 0 of NaN. `as i32` would convert one value after the other.
 #[inline(always)]
 pub(crate) fn whole(value: f32) -> i32 {
-    /// 1.5 · 2^23: after adding it, the low bits hold the nearest whole number.
-    const ROUND: f32 = 12_582_912.0;
     // `max` turns NaN into 0.
     let value = value.max(0.0);
     let shifted = value + ROUND;

@@ -12,6 +12,8 @@ mod page;
 mod places;
 mod timing;
 
+#[doc(hidden)]
+pub use self::channels::small_channels;
 pub use self::channels::{ChannelRole, ChannelSummary};
 pub use self::delays::{ActionDelay, LagCorrelation, MotionSignal};
 pub use self::findings::{Inspection, inspect};

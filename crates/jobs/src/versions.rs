@@ -2,6 +2,7 @@
 //! `models/NAME/VERSION` below the data directory. The store knows which versions are published and which are active.
 
 mod publish;
+mod sweep;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -181,20 +182,6 @@ impl Versions {
         });
         let parsed = measured.and_then(|measured| serde_json::from_str(&measured.metrics).ok());
         Ok(parsed.unwrap_or_else(|| manifest.metrics.clone()))
-    }
-
-    /// Deletes what is left of versions whose deletion was interrupted, for example by `kill -9`. Failures are logged.
-    async fn sweep(&self) -> Result<(), StoreError> {
-        let mut deleted = BTreeMap::<ModelName, Vec<String>>::new();
-        for (model, version) in self.store.deleted_versions().await? {
-            deleted.entry(model).or_default().push(version.to_string());
-        }
-        for (model, versions) in deleted {
-            if let Err(error) = self.store.objects().sweep(&format!("models/{model}"), &versions).await {
-                warn!(%model, %error, "could not delete what is left of deleted versions");
-            }
-        }
-        Ok(())
     }
 
     /// Loads one version of every model: the active one, else the shipped one, else the newest that can be loaded. Versions

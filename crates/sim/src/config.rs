@@ -1,8 +1,5 @@
 //! Settings of a world and their ranges.
 
-use std::fmt;
-use std::str::FromStr;
-
 use serde::{Deserialize, Serialize};
 
 use super::arena;
@@ -10,6 +7,7 @@ use super::error::SimError;
 use super::room_set::RoomSet;
 use foreframe_core::frame::MAX_SIDE_PX;
 use foreframe_core::frame::warp::CameraModel;
+use foreframe_core::named_enum;
 
 /// Tb1's camera.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -70,50 +68,26 @@ impl Default for CameraConfig {
     }
 }
 
-/// What the room looks like.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
-#[serde(rename_all = "lowercase")]
-pub enum Look {
-    /// Walls, pillars and floor in shades of gray.
-    #[default]
-    Gray,
-    /// Walls, pillars and floor are white, so that only the robots and their shadows stand out: bright, sparse frames as in
-    /// the paper.
-    Bright,
+named_enum! {
+    /// What the room looks like.
+    #[derive(Default, Serialize, Deserialize)]
+    #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
+    #[serde(rename_all = "lowercase")]
+    pub enum Look {
+        /// Walls, pillars and floor in shades of gray.
+        #[default]
+        Gray = "gray",
+        /// Walls, pillars and floor are white, so that only the robots and their shadows stand out: bright, sparse frames as in
+        /// the paper.
+        Bright = "bright",
+    }
+    else |name| -> SimError { SimError::UnknownLook { name: name.to_owned() } }
 }
 
 impl Look {
-    /// All looks.
-    pub const ALL: [Self; 2] = [Self::Gray, Self::Bright];
-
-    /// `gray` or `bright`.
-    #[must_use]
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Gray => "gray",
-            Self::Bright => "bright",
-        }
-    }
-
     #[expect(clippy::trivially_copy_pass_by_ref, reason = "serde passes a reference")]
     fn is_gray(&self) -> bool {
         *self == Self::Gray
-    }
-}
-
-impl fmt::Display for Look {
-    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
-        formatter.write_str(self.name())
-    }
-}
-
-impl FromStr for Look {
-    type Err = SimError;
-
-    fn from_str(name: &str) -> Result<Self, SimError> {
-        let found = Self::ALL.into_iter().find(|look| look.name() == name);
-        found.ok_or_else(|| SimError::UnknownLook { name: name.to_owned() })
     }
 }
 

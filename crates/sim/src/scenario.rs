@@ -1,9 +1,7 @@
 //! The scenarios, the random parameters of a trial, and which trials are held out for the test on unseen start/goal pairs and
 //! PID gains.
 
-use std::fmt;
 use std::ops::Range;
-use std::str::FromStr;
 
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
@@ -17,6 +15,7 @@ use super::room_set::RoomSet;
 use super::rooms::free_place;
 use super::route::{PidGains, Route};
 use super::{arena, crossing, robot};
+use foreframe_core::named_enum;
 use foreframe_core::types::Seed;
 
 /// (start, goal) pairs of Tb2 that are never used for training. Their routes cross routes of the other pairs.
@@ -28,42 +27,28 @@ const CROWD: usize = 3;
 /// Largest number of robots besides Tb1 and Tb2 in parameters written by hand.
 const MAX_CROWD: usize = 16;
 
-/// Which robots move, and when a trial ends.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
-#[serde(rename_all = "kebab-case")]
-pub enum Scenario {
-    /// The paper's scenario: Tb1 stands still; the trial ends when Tb2 reaches its goal.
-    StaticObserver,
-    /// Tb1 drives too. When Tb2 reaches its goal, it gets another one; the trial ends at its time limit.
-    MovingObserver,
-    /// Like `moving-observer`, with three more robots.
-    Crowded,
-    /// Like `moving-observer`, with one, four or eight more robots that drive to and fro across the way ahead of Tb1; some
-    /// halt, turn back, or stand while Tb1 is close before them.
-    Crossing,
+named_enum! {
+    /// Which robots move, and when a trial ends.
+    #[derive(Hash, Serialize, Deserialize)]
+    #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
+    #[serde(rename_all = "kebab-case")]
+    pub enum Scenario {
+        /// The paper's scenario: Tb1 stands still; the trial ends when Tb2 reaches its goal.
+        StaticObserver = "static-observer",
+        /// Tb1 drives too. When Tb2 reaches its goal, it gets another one; the trial ends at its time limit.
+        MovingObserver = "moving-observer",
+        /// Like `moving-observer`, with three more robots.
+        Crowded = "crowded",
+        /// Like `moving-observer`, with one, four or eight more robots that drive to and fro across the way ahead of Tb1; some
+        /// halt, turn back, or stand while Tb1 is close before them.
+        Crossing = "crossing",
+    }
+    else |name| -> SimError {
+        SimError::UnknownScenario { name: name.to_owned(), known: Self::ALL.map(Self::name).join(", ") }
+    }
 }
 
 impl Scenario {
-    /// All scenarios.
-    pub const ALL: [Self; 4] = [
-        Self::StaticObserver,
-        Self::MovingObserver,
-        Self::Crowded,
-        Self::Crossing,
-    ];
-
-    /// The scenario's name, on the command line and on disk.
-    #[must_use]
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::StaticObserver => "static-observer",
-            Self::MovingObserver => "moving-observer",
-            Self::Crowded => "crowded",
-            Self::Crossing => "crossing",
-        }
-    }
-
     /// Whether Tb1 drives.
     #[must_use]
     pub fn observer_drives(self) -> bool {
@@ -74,24 +59,6 @@ impl Scenario {
     #[must_use]
     pub fn has_several_goals(self) -> bool {
         self != Self::StaticObserver
-    }
-}
-
-impl fmt::Display for Scenario {
-    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        out.write_str(self.name())
-    }
-}
-
-impl FromStr for Scenario {
-    type Err = SimError;
-
-    fn from_str(name: &str) -> Result<Self, SimError> {
-        let found = Self::ALL.into_iter().find(|scenario| scenario.name() == name);
-        found.ok_or_else(|| SimError::UnknownScenario {
-            name: name.to_owned(),
-            known: Self::ALL.map(Self::name).join(", "),
-        })
     }
 }
 

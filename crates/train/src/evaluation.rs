@@ -49,6 +49,8 @@ pub use self::camera_estimate::{CameraEstimate, estimate_camera};
 pub use self::compatible::check_fit;
 #[doc(hidden)]
 pub use self::compatible::check_saving;
+#[doc(hidden)]
+pub use self::config::MIN_RESAMPLES;
 pub use self::config::{EvaluateConfig, NEAREST_WINDOWS, ScoredSplit};
 #[doc(hidden)]
 pub use self::division::EvaluationPart;

@@ -3,7 +3,7 @@
 
 use std::path::{Path, PathBuf};
 
-use figment::error::Kind;
+use figment::error::{Actual, Kind};
 use figment::util::nest;
 use figment::value::{Dict, Map, Value};
 use figment::{Figment, Metadata, Profile, Provider};
@@ -292,6 +292,12 @@ fn unknown(known: &Dict, given: &Dict, parent: &str) -> Option<(String, String)>
 fn expected_kind(kind: &Kind) -> String {
     match kind {
         Kind::UnknownVariant(_, variants) => variants.join(" or "),
+        // TOML has no larger ones.
+        Kind::InvalidType(Actual::Str(digits), expected)
+            if expected.starts_with('u') && digits.bytes().all(|digit| digit.is_ascii_digit()) =>
+        {
+            format!("a whole number, 0 to {}", i64::MAX)
+        }
         Kind::InvalidType(_, expected) | Kind::InvalidValue(_, expected) => match expected.as_str() {
             "u8" | "u16" | "u32" | "u64" | "usize" => "a whole number, 0 or more".to_owned(),
             "f32" | "f64" => "a number".to_owned(),
@@ -334,6 +340,25 @@ mod tests {
             Some(toml::Value::String("runs/x y".to_owned()))
         );
         assert_eq!(settings.value("size"), Some(toml::Value::Integer(7)));
+    }
+
+    #[test]
+    fn an_integer_that_toml_cannot_hold_is_told_the_largest() {
+        #[derive(Debug, serde::Deserialize)]
+        struct Sizes {
+            #[serde(rename = "size")]
+            _size: u64,
+        }
+        let told = |value: &str| {
+            let settings = merged(&[&format!("size={value}")]).unwrap();
+            settings.extract::<Sizes>(|_| None).unwrap_err().to_string()
+        };
+        let largest = told("18446744073709551615");
+        assert!(
+            largest.ends_with("a whole number, 0 to 9223372036854775807"),
+            "{largest}"
+        );
+        assert!(told("many").ends_with("a whole number, 0 or more"));
     }
 
     #[test]

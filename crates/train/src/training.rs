@@ -33,7 +33,7 @@ use self::config::CodecStart;
 pub use self::config::TrainConfig;
 pub use self::error::TrainError;
 use self::journal::Journal;
-pub use self::journal::SAMPLE_FILE;
+pub use self::journal::{CURVE_POINTS, SAMPLE_FILE};
 pub use self::observer::{Observer, TrainingEvent, TrainingStage};
 pub use self::plan::parameter_count;
 use self::plan::{TrainingPlan, window_frames};
@@ -41,7 +41,7 @@ use self::stage::{StageEnd, StageRunner};
 pub use self::start::check_start;
 use self::state::TrainState;
 pub use self::sweep::Sweep;
-use foreframe_core::files::write_atomically;
+use foreframe_core::files::{is_transient, write_atomically};
 use foreframe_core::nn::Parameters;
 use foreframe_core::registry::{self, Manifest, StoredWeights};
 use foreframe_data::dataset::Dataset;
@@ -95,7 +95,7 @@ pub fn run(
 ) -> Result<TrainingOutcome, TrainError> {
     let (config, dataset) = (training.config, training.dataset);
     config.validate()?;
-    let files = RunFiles::check(training.run_dir, config, &dataset.info().content_hash)?;
+    let files = RunFiles::check(training.run_dir, config, dataset)?;
     // Check the data before creating the directory, so that a refused training leaves no files.
     let plan = TrainingPlan::new(config, dataset)?;
     if let Some(start) = training.start {
@@ -104,8 +104,7 @@ pub fn run(
     let _lock = files.lock()?;
     let model_dir = files.path(MODEL_DIR);
     if model_dir.join(registry::MANIFEST_FILE).is_file() {
-        let manifest = Box::new(registry::manifest::read(&model_dir)?);
-        return Ok(TrainingOutcome::Finished { model_dir, manifest });
+        return finished(model_dir, training.run_dir);
     }
     let interrupted = |stage, step| Ok(TrainingOutcome::Interrupted { stage, step });
     let mut state = match files.load_latest(&plan.spec, &config.run, observer)? {
@@ -164,6 +163,22 @@ pub fn run(
     write_atomically(&history_file, &history).map_err(io_failed("write", &history_file))?;
     let manifest = Box::new(registry::publish(&model_dir, &state.parameters, &manifest)?);
     Ok(TrainingOutcome::Finished { model_dir, manifest })
+}
+
+/// The outcome of a run that was complete before. Errors: `DamagedModel`, `Registry`.
+fn finished(model_dir: PathBuf, run_dir: &Path) -> Result<TrainingOutcome, TrainError> {
+    match registry::load(&model_dir).and_then(|_| registry::manifest::read(&model_dir)) {
+        Ok(manifest) => Ok(TrainingOutcome::Finished {
+            manifest: Box::new(manifest),
+            model_dir,
+        }),
+        Err(source) if is_transient(&source) => Err(source.into()),
+        Err(source) => Err(TrainError::DamagedModel {
+            run_dir: run_dir.to_owned(),
+            model_dir,
+            source,
+        }),
+    }
 }
 
 /// The stage, or the next one if it has no steps: most networks have no pre-training.

@@ -111,16 +111,25 @@ fn print_images(inspection: &Inspection) -> Result<(), CliError> {
 
 fn print_channel(channel: &ChannelSummary) -> Result<(), CliError> {
     print_line(format!(
-        "  {:<11} {} {}: {:.3} to {:.3}, mean {:.3}, deviation {:.3}  {}",
+        "  {:<11} {} {}: {} to {}, mean {}, deviation {}  {}",
         channel.role,
         channel.name,
         channel.unit,
-        channel.min,
-        channel.max,
-        channel.mean,
-        channel.std,
+        shown(channel.min),
+        shown(channel.max),
+        shown(channel.mean),
+        shown(channel.std),
         sparkline(&channel.histogram.counts)
     ))
+}
+
+/// A number with three decimals, or with three digits that count if it is too small for them.
+fn shown(value: f64) -> String {
+    if value != 0.0 && value.abs() < 0.01 {
+        format!("{value:.2e}")
+    } else {
+        format!("{value:.3}")
+    }
 }
 
 /// A histogram in one line of text.
@@ -149,6 +158,14 @@ fn print_delay(delay: &ActionDelay, period_s: f64) -> Result<(), CliError> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn small_numbers_keep_their_digits() {
+        assert_eq!(
+            [0.0, 7e-5, -0.25, 123.0].map(shown),
+            ["0.000", "7.00e-5", "-0.250", "123.000"]
+        );
+    }
 
     #[test]
     fn a_sparkline_shows_empty_and_full_ranges() {

@@ -25,9 +25,19 @@ pub(in crate::server) struct BodyBudget {
 
 /// The bodies in flight exceed the budget.
 #[derive(Debug, thiserror::Error)]
-#[error("the requests and messages that are being read exceed {limit} bytes; try again in 1 s")]
-pub(in crate::server) struct BodyBudgetError {
-    limit: usize,
+pub(in crate::server) enum BodyBudgetError {
+    /// All together.
+    #[error("the requests and messages that are being read exceed {limit} bytes; try again in 1 s")]
+    Full {
+        /// The budget.
+        limit: usize,
+    },
+    /// One alone.
+    #[error("it is longer than {limit} bytes (setting max_total_body_bytes)")]
+    TooLong {
+        /// The budget.
+        limit: usize,
+    },
 }
 
 impl BodyBudget {
@@ -54,11 +64,16 @@ pub(super) struct BodyShare {
 }
 
 impl BodyShare {
+    /// Errors: `Full`, `TooLong`.
     pub(super) fn take(&self, bytes: usize) -> Result<(), BodyBudgetError> {
         let BodyBudget { used, limit } = &self.budget;
-        let sum = |used: usize| used.checked_add(bytes).filter(|sum| sum <= limit);
+        let (limit, own) = (*limit, self.taken.load(Ordering::Acquire).saturating_add(bytes));
+        if own > limit {
+            return Err(BodyBudgetError::TooLong { limit });
+        }
+        let sum = |used: usize| used.checked_add(bytes).filter(|sum| *sum <= limit);
         let taken = used.fetch_update(Ordering::AcqRel, Ordering::Acquire, sum);
-        taken.map_err(|_| BodyBudgetError { limit: *limit })?;
+        taken.map_err(|_| BodyBudgetError::Full { limit })?;
         self.taken.fetch_add(bytes, Ordering::AcqRel);
         Ok(())
     }
@@ -105,6 +120,19 @@ pub(in crate::server) fn cause<'a>(error: &'a (dyn Error + 'static)) -> Option<&
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn what_alone_exceeds_the_budget_is_too_long_however_full_it_is() {
+        let budget = BodyBudget::new(&ServerConfig {
+            max_total_body_bytes: 100,
+            ..ServerConfig::default()
+        });
+        let (first, second) = (budget.share(), budget.share());
+        first.take(60).unwrap();
+        assert!(matches!(first.take(41), Err(BodyBudgetError::TooLong { limit: 100 })));
+        assert!(matches!(second.take(41), Err(BodyBudgetError::Full { limit: 100 })));
+        assert!(matches!(second.take(101), Err(BodyBudgetError::TooLong { .. })));
+    }
 
     #[test]
     fn the_budget_is_whole_again_after_the_request() {

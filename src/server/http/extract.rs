@@ -12,11 +12,15 @@ use serde::de::value::MapAccessDeserializer;
 use serde::de::{DeserializeOwned, MapAccess, Visitor};
 use serde::{Deserialize, Deserializer};
 
-use super::body_budget;
+use super::body_budget::{self, BodyBudgetError};
 use super::problem::ApiError;
 
 /// The media type of `MessagePack`.
 pub(super) const MSGPACK: &str = "application/msgpack";
+
+/// What is wrong with a body that is not read to its end.
+const TOO_LONG: &str =
+    "the body is longer than this server takes (settings max_body_bytes and, for jobs, max_job_bytes)";
 
 /// A JSON body. It must be an object: serde would also accept a list of the fields' values.
 pub(in crate::server) struct Json<T>(pub(in crate::server) T);
@@ -90,23 +94,77 @@ pub(in crate::server) enum ResponseFormat {
 }
 
 impl ResponseFormat {
-    /// The first supported media type in an `Accept` header; JSON if the header is absent.
+    /// All, with their media types; among those that a client likes equally, the first one is chosen.
+    const ALL: [(Self, &str); 4] = [
+        (Self::Json, "application/json"),
+        (Self::Msgpack, MSGPACK),
+        (Self::Png, "image/png"),
+        (Self::Gif, "image/gif"),
+    ];
+
+    /// The format with the highest quality in an `Accept` header, of several the one that is named first; JSON if the header is empty.
     fn from_accept(accept: &str) -> Result<Self, ApiError> {
-        let named = accept
+        let ranges: Vec<MediaRange> = accept
             .split(',')
-            .map(|part| part.split(';').next().unwrap_or("").trim());
-        for media_type in named {
-            match media_type {
-                "application/json" | "application/*" | "*/*" | "" => return Ok(Self::Json),
-                MSGPACK => return Ok(Self::Msgpack),
-                "image/png" | "image/*" => return Ok(Self::Png),
-                "image/gif" => return Ok(Self::Gif),
-                _ => {}
-            }
+            .enumerate()
+            .filter_map(|(place, text)| MediaRange::parse(place, text))
+            .collect();
+        if ranges.is_empty() {
+            return Ok(Self::Json);
         }
-        Err(ApiError::NotAcceptable(format!(
-            "a prediction is not available as {accept}; this server has application/json, application/msgpack, image/png and image/gif"
-        )))
+        let acceptable = Self::ALL.iter().filter_map(|(format, media_type)| {
+            // The most specific range counts: `image/gif;q=0, */*` is anything but GIF.
+            let fitting = ranges.iter().filter(|range| range.holds(media_type));
+            let range = fitting.min_by_key(|range| range.wildcards())?;
+            (range.quality > 0.0).then_some((*format, range))
+        });
+        let best = acceptable.min_by(|(_, one), (_, other)| {
+            let by_quality = other.quality.total_cmp(&one.quality);
+            by_quality.then(one.place.cmp(&other.place))
+        });
+        best.map(|(format, _)| format).ok_or_else(|| {
+            ApiError::NotAcceptable(format!(
+                "a prediction is not available as {accept}; this server has application/json, application/msgpack, image/png and image/gif"
+            ))
+        })
+    }
+}
+
+/// Media types of an `Accept` header (RFC 9110), as `image/*;q=0.5`.
+struct MediaRange<'a> {
+    /// Its place in the header.
+    place: usize,
+    kind: &'a str,
+    subtype: &'a str,
+    /// From 0, not acceptable, to 1.
+    quality: f32,
+}
+
+impl<'a> MediaRange<'a> {
+    fn parse(place: usize, text: &'a str) -> Option<Self> {
+        let mut parts = text.split(';').map(str::trim);
+        let (kind, subtype) = parts.next()?.split_once('/')?;
+        let quality = parts.find_map(|parameter| {
+            let (name, value) = parameter.split_once('=')?;
+            name.eq_ignore_ascii_case("q").then(|| value.parse().ok())?
+        });
+        Some(Self {
+            place,
+            kind,
+            subtype,
+            quality: quality.filter(|quality| (0.0..=1.0).contains(quality)).unwrap_or(1.0),
+        })
+    }
+
+    fn holds(&self, media_type: &str) -> bool {
+        let is = |range: &str, part: &str| range == "*" || range.eq_ignore_ascii_case(part);
+        let parts = media_type.split_once('/');
+        parts.is_some_and(|(kind, subtype)| is(self.kind, kind) && is(self.subtype, subtype))
+    }
+
+    /// The fewer, the more specific.
+    fn wildcards(&self) -> usize {
+        [self.kind, self.subtype].iter().filter(|part| **part == "*").count()
     }
 }
 
@@ -114,8 +172,14 @@ impl<S: Send + Sync> FromRequestParts<S> for ResponseFormat {
     type Rejection = ApiError;
 
     async fn from_request_parts(parts: &mut Parts, _: &S) -> Result<Self, ApiError> {
-        let accept = parts.headers.get(header::ACCEPT).map_or(Ok("*/*"), HeaderValue::to_str);
-        Self::from_accept(accept.map_err(|_| ApiError::Malformed("the header Accept is not ASCII".to_owned()))?)
+        let accept: Result<Vec<&str>, _> = parts
+            .headers
+            .get_all(header::ACCEPT)
+            .iter()
+            .map(HeaderValue::to_str)
+            .collect();
+        let accept = accept.map_err(|_| ApiError::Malformed("the header Accept is not ASCII".to_owned()))?;
+        Self::from_accept(&accept.join(", "))
     }
 }
 
@@ -158,10 +222,12 @@ impl From<BytesRejection> for ApiError {
 /// The answer to a request whose body was not read because it, or all bodies together, are too long; `None` if that is not why.
 pub(super) fn too_long(status: StatusCode, error: &(dyn Error + 'static)) -> Option<ApiError> {
     if status == StatusCode::PAYLOAD_TOO_LARGE {
-        let detail = "the body is longer than this server takes".to_owned();
-        return Some(ApiError::TooLarge(detail));
+        return Some(ApiError::TooLarge(TOO_LONG.to_owned()));
     }
-    body_budget::cause(error).map(|exceeded| ApiError::unavailable(exceeded.to_string()))
+    body_budget::cause(error).map(|exceeded| match exceeded {
+        BodyBudgetError::TooLong { .. } => ApiError::TooLarge(TOO_LONG.to_owned()),
+        BodyBudgetError::Full { .. } => ApiError::unavailable(exceeded.to_string()),
+    })
 }
 
 impl From<PathRejection> for ApiError {
@@ -180,12 +246,29 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_first_supported_media_type_is_chosen() {
-        assert_eq!(
-            ResponseFormat::from_accept("text/html, image/gif;q=0.8, */*"),
-            Ok(ResponseFormat::Gif)
-        );
-        assert_eq!(ResponseFormat::from_accept("*/*"), Ok(ResponseFormat::Json));
-        assert!(ResponseFormat::from_accept("text/html").is_err());
+    fn the_media_type_that_the_client_likes_most_is_chosen() {
+        for (accept, expected) in [
+            ("", ResponseFormat::Json),
+            ("*/*", ResponseFormat::Json),
+            ("text/html, image/gif, */*", ResponseFormat::Gif),
+            ("text/html, image/gif;q=0.8, */*", ResponseFormat::Json),
+            ("text/html, image/gif;q=0.8, */*;q=0.1", ResponseFormat::Gif),
+            ("image/gif;q=0, application/json", ResponseFormat::Json),
+            ("application/json;q=0.1, image/png;q=0.9", ResponseFormat::Png),
+            ("application/json;q=0, application/*", ResponseFormat::Msgpack),
+            ("image/png;Q=0, image/*", ResponseFormat::Gif),
+            ("IMAGE/PNG", ResponseFormat::Png),
+            (
+                "application/json;charset=utf-8;q=0.2, Application/MsgPack;q=0.3",
+                ResponseFormat::Msgpack,
+            ),
+            ("image/png, image/gif", ResponseFormat::Png),
+            ("image/gif, image/png", ResponseFormat::Gif),
+        ] {
+            assert_eq!(ResponseFormat::from_accept(accept), Ok(expected), "{accept}");
+        }
+        for accept in ["text/html", "image/png;q=0", "*/*;q=0.0"] {
+            assert!(ResponseFormat::from_accept(accept).is_err(), "{accept}");
+        }
     }
 }

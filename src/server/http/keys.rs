@@ -71,6 +71,11 @@ impl Caller {
         maker.key.is_none() || maker.key == self.key
     }
 
+    /// Whether this caller has the same key as another one; never without a key.
+    pub(in crate::server) fn has_key_of(self, other: Self) -> bool {
+        self.key.is_some() && self.key == other.key
+    }
+
     /// Whether this caller may see what another caller created: its own, and with the scope `admin` everything.
     pub(in crate::server) fn may_see(self, maker: Self) -> bool {
         self.is_admin || self.may_use(maker)

@@ -139,7 +139,7 @@ pub(in crate::server) async fn trace(State(trace): State<RequestTrace>, request:
 /// A small compressed body can become a huge one, so the server decodes none.
 fn refuse_encoded(headers: &HeaderMap) -> Result<(), ApiError> {
     match headers.get(header::CONTENT_ENCODING) {
-        Some(encoding) if encoding != "identity" => Err(ApiError::UnsupportedMedia(
+        Some(encoding) if !encoding.as_bytes().eq_ignore_ascii_case(b"identity") => Err(ApiError::UnsupportedMedia(
             "the body has a Content-Encoding; send it without".to_owned(),
         )),
         _ => Ok(()),
@@ -159,7 +159,8 @@ mod tests {
     #[test]
     fn an_encoded_body_is_refused() {
         let with = |encoding| HeaderMap::from_iter([(header::CONTENT_ENCODING, HeaderValue::from_static(encoding))]);
-        assert!(refuse_encoded(&HeaderMap::new()).is_ok() && refuse_encoded(&with("identity")).is_ok());
+        assert!(refuse_encoded(&HeaderMap::new()).is_ok());
+        assert!(refuse_encoded(&with("identity")).is_ok() && refuse_encoded(&with("IDENTITY")).is_ok());
         assert!(refuse_encoded(&with("gzip")).is_err() && refuse_encoded(&with("identity, br")).is_err());
     }
 }

@@ -18,14 +18,20 @@ use super::problem::ApiError;
 use crate::server::config::ServerConfig;
 
 const METHODS: HeaderValue = HeaderValue::from_static("GET, POST, DELETE");
-const HEADERS: HeaderValue =
-    HeaderValue::from_static("authorization, content-type, idempotency-key, x-request-id, x-session-token");
+/// The headers that a page may send.
+const HEADERS: HeaderValue = HeaderValue::from_static(
+    "authorization, content-type, idempotency-key, inference-header-content-length, last-event-id, x-request-id, \
+     x-session-token",
+);
+/// The headers of answers that a page may read, besides those that any page may.
+const EXPOSED: HeaderValue =
+    HeaderValue::from_static("inference-header-content-length, location, retry-after, x-request-id");
 
-/// Whether a text is the origin of a web page.
+/// Whether a text is the origin of a web page: it has no user and no path.
 pub(crate) fn is_origin(text: &str) -> bool {
     text.parse::<Uri>().is_ok_and(|uri| {
         let is_web = matches!(uri.scheme_str(), Some("http" | "https"));
-        is_web && uri.authority().is_some() && uri.path_and_query().is_none_or(|rest| rest == "/")
+        is_web && uri.authority().is_some_and(is_host_and_port) && uri.path_and_query().is_none_or(|rest| rest == "/")
     })
 }
 
@@ -39,15 +45,21 @@ pub(in crate::server) struct OriginPolicy {
 impl OriginPolicy {
     pub(in crate::server) fn new(config: &ServerConfig, keys: Keys) -> Self {
         Self {
-            // Browsers write neither a slash at the end nor capital letters.
             allowed: config
                 .cors_origins
                 .iter()
-                .map(|origin| origin.trim_end_matches('/').to_ascii_lowercase())
+                .map(|origin| as_browsers_write(origin))
                 .collect(),
             keys,
         }
     }
+}
+
+/// The origin without capital letters, a slash at the end and the port that its scheme implies.
+fn as_browsers_write(origin: &str) -> String {
+    let origin = origin.trim_end_matches(['/', ':']).to_ascii_lowercase();
+    let implied = if origin.starts_with("https://") { ":443" } else { ":80" };
+    origin.strip_suffix(implied).unwrap_or(&origin).to_owned()
 }
 
 /// Refuses requests to a foreign host and requests of a foreign page, unless they are configured. Answers preflight
@@ -96,6 +108,8 @@ pub(in crate::server) async fn check(
     if is_preflight {
         headers.insert(header::ACCESS_CONTROL_ALLOW_METHODS, METHODS);
         headers.insert(header::ACCESS_CONTROL_ALLOW_HEADERS, HEADERS);
+    } else {
+        headers.insert(header::ACCESS_CONTROL_EXPOSE_HEADERS, EXPOSED);
     }
     Ok(response)
 }
@@ -153,9 +167,11 @@ fn is_foreign(host: &Authority, allowed: &[String]) -> bool {
     let name = host.host();
     let is_address = name.starts_with('[') || name.parse::<Ipv4Addr>().is_ok();
     let is_local = !name.contains('.') || name.ends_with(".localhost");
-    let is_allowed = allowed
-        .iter()
-        .any(|origin| origin.split_once("://").is_some_and(|(_, of)| of == host.as_str()));
+    let is_of = |origin: &String| {
+        let of_page = origin.split_once("://");
+        of_page.is_some_and(|(scheme, of)| of.parse().is_ok_and(|of| are_same(host, &of, scheme)))
+    };
+    let is_allowed = allowed.iter().any(is_of);
     !is_address && !is_local && !is_allowed
 }
 

@@ -15,7 +15,7 @@ use foreframe_core::error_text::{with_causes, without_middle};
 use foreframe_core::files::is_transient;
 
 /// When the client may try again if nothing better is known, in seconds.
-const RETRY_AFTER_S: u64 = 1;
+pub(in crate::server) const RETRY_AFTER_S: u64 = 1;
 
 const MEDIA_TYPE: &str = "application/problem+json";
 
@@ -245,7 +245,9 @@ pub(in crate::server) fn unreadable_request(head: &[u8]) -> Option<Vec<u8>> {
         StatusCode::BAD_REQUEST => ("malformed", "the request is not valid HTTP/1.1"),
         StatusCode::URI_TOO_LONG => ("too-large", "the path of the request is too long"),
         StatusCode::REQUEST_HEADER_FIELDS_TOO_LARGE => {
-            ("too-large", "the head of the request is longer than this server takes")
+            let detail = "the head of the request is longer than this server takes (setting max_header_bytes), or has more \
+                          than 100 headers";
+            ("too-large", detail)
         }
         _ => return None,
     };

@@ -62,7 +62,7 @@ impl OpenpiObservation {
         Ok(FrameStep {
             seq,
             timestamp_us: 0,
-            conditioning: conditions.check(&OBSERVATION_FIELDS, manifest, max_steps)?,
+            conditions: conditions.check(&OBSERVATION_FIELDS, manifest, max_steps)?,
             frame: images::resized("frame", image(frame)?, self.resize, manifest)?,
             format: ImageFormat::Raw,
             is_overtaken: false,

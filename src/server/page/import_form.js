@@ -16,11 +16,15 @@ const datasetName = name => name.replace(ENDINGS, "").toLowerCase().replaceAll(/
 
 // The form as it is filled in, its upload and its job. It is kept outside of the component, so that an upload goes on while another view
 // is open. `share` is how much of the file was sent; null without an upload.
-const { now, change, use: useForm } = shared({ fields: { name: "", source: "", size: "64x64", rate: "", action: "", state: "" }, share: null, stop: null, job_id: null, wrong: "" });
+const EMPTY = { name: "", source: "", size: "64x64", rate: "", every: "", action: "", state: "", fov: "", tilt: "", camera_height: "", skip_bad: false };
+const { now, change, use: useForm } = shared({ fields: EMPTY, share: null, stop: null, job_id: null, wrong: "" });
 const fill = changes => change({ fields: { ...now().fields, ...changes } });
 
-async function submit({ name, source, size, rate, action, state }) {
-  const spec = { kind: "import", name, source, ...(size && { size }), ...(rate && { rate: +rate }), ...(action && { action: list(action) }), ...(state && { state: list(state) }) };
+const NUMBERS = ["rate", "every", "fov", "tilt", "camera_height"];
+
+async function submit({ name, source, size, action, state, skip_bad, ...fields }) {
+  const numbers = Object.fromEntries(NUMBERS.filter(field => fields[field] !== "").map(field => [field, +fields[field]]));
+  const spec = { kind: "import", name, source, ...(size && { size }), ...numbers, ...(action && { action: list(action) }), ...(state && { state: list(state) }), ...(skip_bad && { skip_bad }) };
   try {
     const { id } = await call("POST", "/v1/jobs", spec);
     change({ job_id: id, wrong: "" });
@@ -78,9 +82,16 @@ export function Import({ jobs }) {
     <label>Path in the import folder, or upload <input ...${field("source")} required placeholder="drive-1" /></label>
     <label>Size <input ...${field("size")} pattern="[0-9]{1,4}x[0-9]{1,4}" /></label>
     <label>Frames per second <input ...${field("rate")} type="number" step="any" min="0.01" placeholder="as recorded" /></label>
+    <label>Keep every Nth frame <input ...${field("every")} type="number" min="1" placeholder="1: all" /></label>
     <label>Actions <input ...${field("action")} placeholder="found by name" /></label>
     <label>States <input ...${field("state")} placeholder="found by name" /></label>
-    </div><p class="quiet">Actions are what the robot was told, states what it measured. Columns of a table are found if their names begin with <code>action</code> or <code>state</code>; write the names of others here.</p>
+    </div><p class="quiet">Actions are what the robot was told, states what it measured. Columns of a table are found if their names begin with <code>action</code> or <code>state</code>; write the names of others here, or <code>none</code>.</p>
+    <details><summary>Camera and damage</summary><div class="form">
+    <label>Field of view, left to right, in degrees <input ...${field("fov")} type="number" step="any" placeholder="unknown" /></label>
+    <label>Looks down by, in degrees <input ...${field("tilt")} type="number" step="any" placeholder="0" /></label>
+    <label>Height above the floor, in metres <input ...${field("camera_height")} type="number" step="any" placeholder="unknown" /></label>
+    <fieldset class="wide"><legend>Damaged images and lines</legend><label><input type="checkbox" checked=${fields.skip_bad} onChange=${() => fill({ skip_bad: !fields.skip_bad })} /> leave them out and list them, instead of stopping there</label></fieldset>
+    </div></details>
     <div class="actions"><button class="main">Import</button></div>
     <p class="files"><label>Or drop a file here, or choose one: it is imported with these settings <input type="file" onChange=${event => { take(event.target.files); event.target.value = ""; }} /></label></p>
     ${stop && html`<div class="sending"><progress aria-label="progress of the upload" max="1" value=${share} /><span class="quiet">${share < 1 ? `uploaded ${(100 * share).toFixed(0)} %` : "the import begins…"}</span>

@@ -9,7 +9,8 @@ export const isFinal = job => FINAL.includes(job.state);
 // Whether a job trains a model.
 export const isTraining = ({ spec }) => ["train", "adapt"].includes(spec.kind);
 
-export const titleOf = ({ kind, name, model, dataset }) => `${kind} ${name ?? model}${dataset ? ` on ${dataset}` : ""}`;
+// An evaluation has the model's version from its first attempt on.
+export const titleOf = ({ kind, name, model, version, dataset }) => `${kind} ${name ?? model}${version ? ` version ${version}` : ""}${dataset ? ` on ${dataset}` : ""}`;
 
 // Lines of a log that are kept.
 const MOST_LINES = 500;

@@ -23,6 +23,8 @@ export class Robot {
     this.speed = 1;
     // While true, the robot stands; What if shows what it could do.
     this.is_held = false;
+    // For how long it did not move: hidden or held. Its times leave this out.
+    this.rested_ms = 0;
     // Actions that it has to carry out first.
     this.plan = [];
     // Called with each moment and its action before the next one: Dream's step.
@@ -108,11 +110,13 @@ export class Robot {
   }
 
   async tick() {
+    const waited_from_ms = performance.now();
     while ((document.hidden || (this.is_held && !this.plan.length && this.status === "running")) && !this.is_closed) {
       await new Promise(wake => { this.wake = wake; });
     }
     if (this.is_closed) return;
     const started_ms = performance.now();
+    this.rested_ms += started_ms - waited_from_ms;
     const moment = this.now;
     // A stream has the context of one episode.
     if (moment.begins || !this.stream || this.stream.socket.readyState !== WebSocket.OPEN) await this.openStreams();
@@ -156,7 +160,7 @@ export class Robot {
   }
 
   receive(moment, answer) {
-    moment.at_s = performance.now() / 1000;
+    moment.at_s = (performance.now() - this.rested_ms) / 1000;
     if (answer.type === "prediction") moment.prediction = answer;
     this.history.push(moment);
     this.status = answer.type === "prediction" ? "running" : "collecting";

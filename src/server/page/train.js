@@ -91,7 +91,8 @@ const ESTIMATE_AFTER_MS = 300;
 
 // Seconds for each step of finished trainings here with the same start, a preset or a model; null if there was none.
 function secondsPerStep(jobs, start) {
-  const done = jobs.find(({ spec, state }) => spec.kind === "train" && spec.preset === start.preset && spec.from === start.from && state === "succeeded");
+  // One of a single attempt: between two, a job may rest.
+  const done = jobs.find(({ spec, state, attempts }) => spec.kind === "train" && spec.preset === start.preset && spec.from === start.from && state === "succeeded" && attempts === 1);
   return done && done.progress.total ? (done.ended_unix_s - done.started_unix_s) / done.progress.total : null;
 }
 
@@ -101,7 +102,9 @@ function NewTraining({ models, datasets, jobs, submit }) {
   const dataset = datasets.find(({ name }) => name === form.dataset) ?? datasets[0];
   const preset = form.preset || proposedPreset(dataset);
   const set = name => event => setForm({ ...form, [name]: event.target.value });
-  const { settings, wrong } = settingsOf(form.settings, form.steps);
+  // The preset for recordings takes actions; what is written below counts more.
+  const implied = !form.from && preset === "recording" && !dataset.actions.length ? `model.conditioning=${dataset.states.length ? "state" : "none"}` : "";
+  const { settings, wrong } = settingsOf(`${implied}\n${form.settings}`, form.steps);
   const start = form.from ? { from: form.from } : { preset };
   const spec = { kind: "train", name: form.name || dataset.name, ...start, dataset: dataset.name, ...(Object.keys(settings).length && { settings }) };
   const pace_s = secondsPerStep(jobs, start);
@@ -120,7 +123,7 @@ function NewTraining({ models, datasets, jobs, submit }) {
       <label>Name of the model <input value=${form.name} placeholder=${dataset.name} pattern="[a-z0-9][a-z0-9\\-]*" onInput=${set("name")} /></label>
       <label>Steps <input type="number" min="1" value=${form.steps} placeholder=${`of the ${form.from ? "model" : "preset"}`} onInput=${set("steps")} /></label>
       <label class="wide">Other settings, one a line <textarea rows="2" value=${form.settings} placeholder="sequence.batch_size=16" onInput=${set("settings")} /></label>
-    </div><p class="quiet estimate">${time} ${room}</p>${is_refused && html`<p class="wrong">It would be refused: use a smaller model or batch.</p>`}
+    </div>${implied && html`<p class="quiet">This data set has no actions, so <code>${implied}</code> is set.</p>`}<p class="quiet estimate">${time} ${room}</p>${is_refused && html`<p class="wrong">It would be refused: use a smaller model or batch.</p>`}
     <p class="wrong" role="alert">${wrong || (refused && `It would be refused: ${refused}`)}</p>
     <div class="actions"><button class="main">Train</button><${Copy} curl=${() => curl("POST", "/v1/jobs", spec)} python=${() => requests("POST", "/v1/jobs", spec)} /></div></form>`;
 }
@@ -155,10 +158,14 @@ function NewEvaluation({ models, datasets, submit }) {
   const [form, setForm] = useState({});
   const model = form.model ?? models[0]?.name;
   const dataset = form.dataset ?? datasets[0].name;
-  const spec = { kind: "evaluate", model, dataset, ...(form.windows && { windows: +form.windows }) };
+  const { versions = [], active_version } = models.find(({ name }) => name === model) ?? {};
+  const version = versions.includes(+form.version) ? +form.version : active_version;
+  const spec = { kind: "evaluate", model, ...(version !== active_version && { version }), dataset, ...(form.windows && { windows: +form.windows }) };
   const set = name => event => setForm({ ...form, [name]: event.target.value });
+  const setModel = event => setForm({ ...form, model: event.target.value, version: undefined });
   return models.length > 0 && html`<form class="card" onSubmit=${event => { event.preventDefault(); submit(spec); }}><h2>New evaluation</h2><div class="form">
-      <label>Model <select value=${model} onChange=${set("model")}>${models.map(({ name }) => html`<option value=${name}>${name}</option>`)}</select></label>
+      <label>Model <select value=${model} onChange=${setModel}>${models.map(({ name }) => html`<option value=${name}>${name}</option>`)}</select></label>
+      ${versions.length > 1 && html`<label>Version <select value=${version} onChange=${set("version")}>${versions.map(one => html`<option value=${one}>${one}${one === active_version ? ", active" : ""}</option>`)}</select></label>`}
       <label>Data set <select value=${dataset} onChange=${set("dataset")}>${datasets.map(({ name }) => html`<option value=${name}>${name}</option>`)}</select></label>
       <label>Windows of each test set <input type="number" min="1" max="100000" value=${form.windows} placeholder="2000" onInput=${set("windows")} /></label>
     </div><p class="quiet">Fewer windows are faster, with wider intervals. Compares the model with baselines on trials that training did not use, and writes a report.</p>
@@ -167,10 +174,16 @@ function NewEvaluation({ models, datasets, submit }) {
 
 const STATES = { running: "good", succeeded: "good", queued: "care", failed: "bad", cancelled: "quiet" };
 
+// From the start of the first attempt to the end of the last one.
+function timeOf({ started_unix_s, ended_unix_s, attempts }) {
+  if (!started_unix_s) return "";
+  return duration((ended_unix_s ?? Date.now() / 1000) - started_unix_s) + (attempts > 1 ? ` (${attempts} attempts, with pauses)` : "");
+}
+
 function Jobs({ jobs, chosen }) {
   return html`<div class="table jobs" tabindex="0" role="region" aria-label="jobs"><table><thead><tr><th scope="col">Job</th><th scope="col">Work</th><th scope="col">State</th><th scope="col">Time</th></tr></thead>
     <tbody>${jobs.map(job => html`<tr class=${job.id === chosen ? "chosen" : ""}><td><a href=${link("train", { job: job.id })} onClick=${event => { event.preventDefault(); note({ job: job.id }); }}>${job.id}</a></td>
-      <td>${titleOf(job.spec)}</td><td class=${STATES[job.state]}>${job.state}</td><td>${job.started_unix_s ? duration((job.ended_unix_s ?? Date.now() / 1000) - job.started_unix_s) : ""}</td></tr>`)}</tbody></table></div>`;
+      <td>${titleOf(job.spec)}</td><td class=${STATES[job.state]}>${job.state}</td><td>${timeOf(job)}</td></tr>`)}</tbody></table></div>`;
 }
 
 // The chosen job as it goes on. One that was submitted just now comes into sight.

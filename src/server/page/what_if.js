@@ -144,7 +144,10 @@ function drawMap(canvas, robot, plans, best) {
   context.clearRect(0, 0, canvas.width, canvas.height);
   context.strokeStyle = color("--line");
   context.fillStyle = color("--quiet");
-  context.font = "13px system-ui";
+  // On a phone the map is shown smaller than it is drawn.
+  const zoom = canvas.width / (canvas.clientWidth || canvas.width), bold = Math.sqrt(zoom);
+  context.font = `${Math.round(13 * zoom)}px system-ui`;
+  context.lineWidth = bold;
   for (const ring of [0.5, 1]) {
     context.beginPath();
     context.arc(...middle, ring * scale, 0, 2 * Math.PI);
@@ -160,13 +163,12 @@ function drawMap(canvas, robot, plans, best) {
     context.beginPath();
     context.moveTo(...at(0, 0));
     for (const [x, y] of wayOf(plan.actions, robot.spec.frame_period_s)) context.lineTo(...at(x, y));
-    context.lineWidth = place === best ? 6 : 3;
+    context.lineWidth = (place === best ? 6 : 3) * bold;
     context.lineCap = "round";
     context.strokeStyle = color(plan.color);
     context.stroke();
   });
-  disc(context, middle, 8, color("--ink"));
-  context.lineWidth = 1;
+  disc(context, middle, 8 * bold, color("--ink"));
 }
 
 function disc(context, [x, y], radius, fill) {

@@ -27,6 +27,7 @@ const BUDGET_MS: u64 = 200;
 #[serde(default, deny_unknown_fields)]
 pub(in crate::server) struct PlanGoal {
     /// Where the robot should get: metres ahead and to the left.
+    #[schema(min_items = 2, max_items = 2)]
     #[serde(skip_serializing_if = "Option::is_none")]
     position_m: Option<[f32; 2]>,
     /// Where it should look in the end: radians, counter-clockwise from where it looks now.
@@ -49,9 +50,11 @@ pub(in crate::server) struct PlanSearch {
     #[schema(value_type = BTreeMap<String, f32>)]
     costs: BTreeMap<PlanCost, f32>,
     /// Limits of the action channels, in their order. Default: the ranges of the training.
+    #[schema(max_items = 4096)]
     #[serde(deserialize_with = "list", skip_serializing_if = "Option::is_none")]
     limits: Option<Vec<ActionLimit>>,
     /// Actions of a plan. Default: the model's horizon.
+    #[schema(minimum = 1, maximum = 256)]
     #[serde(skip_serializing_if = "Option::is_none")]
     steps: Option<usize>,
     /// The time for all of it; the best plan so far is the answer.
@@ -96,6 +99,7 @@ pub struct SessionPlanRequest {
     #[serde(default)]
     format: ImageFormat,
     /// The robot's state. Default: its state at the session's last frame.
+    #[schema(max_items = 4096)]
     #[serde(default, deserialize_with = "list", skip_serializing_if = "Option::is_none")]
     state: Option<Vec<f32>>,
     /// What to reach.
@@ -104,9 +108,11 @@ pub struct SessionPlanRequest {
     #[serde(default)]
     search: PlanSearch,
     /// The plan that the robot follows now. Default: that of the session's last frame.
+    #[schema(max_items = 256)]
     #[serde(default, deserialize_with = "rows", skip_serializing_if = "Option::is_none")]
     present: Option<Vec<Vec<f32>>>,
     /// The action before the plan, from which `max_change` is counted first.
+    #[schema(max_items = 4096)]
     #[serde(default, deserialize_with = "list", skip_serializing_if = "Option::is_none")]
     action: Option<Vec<f32>>,
     /// Whether the answer has the predicted frames.

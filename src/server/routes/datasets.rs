@@ -15,6 +15,7 @@ use crate::server::http::extract::{Path, Query};
 use crate::server::http::page::Page;
 use crate::server::http::problem::ApiError;
 use crate::server::state::App;
+use foreframe_core::files::sha256_hex;
 use foreframe_core::frame::warp::CameraModel;
 use foreframe_core::frame::{Frame, FrameError, codec};
 use foreframe_core::types::{Channel, DatasetName};
@@ -206,7 +207,7 @@ async fn episode_picture(
 }
 
 /// What `make` makes of a data set, given its description and its local directory: from the cache, where it is kept as long
-/// as the data set has the same content, or made now.
+/// as the data set has the same content and description, or made now.
 pub(super) async fn kept(
     app: &App,
     name: &DatasetName,
@@ -215,7 +216,9 @@ pub(super) async fn kept(
 ) -> Result<Bytes, ApiError> {
     let objects = app.store().objects();
     let info = datasets::describe(objects, name).await.map_err(absent)?;
-    let key = format!("dataset/{name}/{}/{part}", info.content_hash);
+    // The content hash leaves out camera, channels and frame period.
+    let described = sha256_hex(info.description().as_bytes());
+    let key = format!("dataset/{name}/{}/{described}/{part}", info.content_hash);
     if let Some(bytes) = app.render_cache.cached(&key) {
         return Ok(bytes);
     }

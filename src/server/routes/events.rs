@@ -22,7 +22,7 @@ pub(in crate::server) fn routes() -> OpenApiRouter<App> {
     OpenApiRouter::new().routes(routes!(events))
 }
 
-/// How often the lists are compared.
+/// How often the lists are read and compared.
 const COMPARE_EVERY: Duration = Duration::from_millis(500);
 /// Jobs that are compared, the newest.
 const COMPARED_JOBS: usize = 100;
@@ -80,46 +80,57 @@ struct ServerEventStream {
 impl ServerEventStream {
     /// The name of the next event; none if the key was revoked or the store failed: the client may connect again.
     async fn next(&mut self) -> Option<&'static str> {
+        let mut pause = Duration::ZERO;
         loop {
-            let now = [self.models().await?, self.jobs().await?];
+            let lists = &self.app.compared_lists;
+            let reading = async {
+                tokio::time::sleep(pause).await;
+                lists.not_older(COMPARE_EVERY, hashes(&self.app)).await
+            };
+            let now = tokio::select! {
+                now = reading => now?,
+                () = stop_requested(&mut self.stopping) => return Some(STOPPING),
+                () = self.app.keys.revoked(self.caller) => return None,
+            };
             for (place, name) in ["models", "jobs"].into_iter().enumerate() {
                 if self.sent[place] != Some(now[place]) {
                     self.sent[place] = Some(now[place]);
                     return Some(name);
                 }
             }
-            tokio::select! {
-                () = tokio::time::sleep(COMPARE_EVERY) => {}
-                () = stop_requested(&mut self.stopping) => return Some(STOPPING),
-                () = self.app.keys.revoked(self.caller) => return None,
-            }
+            pause = COMPARE_EVERY;
         }
     }
+}
 
-    /// A hash of the active versions, of the published ones and of what evaluations measured.
-    async fn models(&self) -> Option<u64> {
-        let store = self.app.store();
-        let mut hasher = DefaultHasher::new();
-        for manifest in self.app.predictor().models() {
-            (manifest.name.as_str(), manifest.version).hash(&mut hasher);
-        }
-        store.published_versions().await.ok()?.hash(&mut hasher);
-        for measured in store.model_metrics().await.ok()? {
-            (measured.model.as_str(), measured.version, measured.metrics).hash(&mut hasher);
-        }
-        Some(hasher.finish())
-    }
+/// Hashes of the lists, models and jobs; none if the store fails.
+async fn hashes(app: &App) -> Option<[u64; 2]> {
+    Some([models(app).await?, jobs(app).await?])
+}
 
-    async fn jobs(&self) -> Option<u64> {
-        let filter = JobFilter {
-            limit: COMPARED_JOBS,
-            ..JobFilter::default()
-        };
-        let mut hasher = DefaultHasher::new();
-        self.app.deleted_datasets.load(Ordering::Relaxed).hash(&mut hasher);
-        for job in self.app.jobs().list(filter).await.ok()? {
-            (job.id.to_string(), job.state.name(), job.cancelling).hash(&mut hasher);
-        }
-        Some(hasher.finish())
+/// A hash of the active versions, of the published ones and of what evaluations measured.
+async fn models(app: &App) -> Option<u64> {
+    let store = app.store();
+    let mut hasher = DefaultHasher::new();
+    for manifest in app.predictor().models() {
+        (manifest.name.as_str(), manifest.version).hash(&mut hasher);
     }
+    store.published_versions().await.ok()?.hash(&mut hasher);
+    for measured in store.model_metrics().await.ok()? {
+        (measured.model.as_str(), measured.version, measured.metrics).hash(&mut hasher);
+    }
+    Some(hasher.finish())
+}
+
+async fn jobs(app: &App) -> Option<u64> {
+    let filter = JobFilter {
+        limit: COMPARED_JOBS,
+        ..JobFilter::default()
+    };
+    let mut hasher = DefaultHasher::new();
+    app.deleted_datasets.load(Ordering::Relaxed).hash(&mut hasher);
+    for job in app.jobs().list(filter).await.ok()? {
+        (job.id.to_string(), job.state.name(), job.cancelling).hash(&mut hasher);
+    }
+    Some(hasher.finish())
 }

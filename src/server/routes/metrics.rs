@@ -23,6 +23,8 @@ pub(in crate::server) const TEXT_FORMAT: &str = "text/plain; version=0.0.4; char
 const FOLD_INTERVAL: Duration = Duration::from_secs(5);
 /// How long the store may take to count the jobs: who reads metrics waits only for some seconds.
 const COUNT_LIMIT: Duration = Duration::from_secs(1);
+/// How long the check may take whether it can be written: longer than it takes itself, so that it is not broken off.
+const WRITE_LIMIT: Duration = Duration::from_secs(3);
 
 pub(in crate::server) fn routes() -> OpenApiRouter<App> {
     OpenApiRouter::new().routes(routes!(metrics))
@@ -40,14 +42,27 @@ async fn metrics(app: App) -> impl IntoResponse {
     ([(header::CONTENT_TYPE, TEXT_FORMAT)], text(app.store()).await)
 }
 
-/// All metrics as text, with the jobs of this store; if it does not answer soon, with those that were counted last. The other metrics
-/// are still useful then.
+/// All metrics as text, with the jobs of this store, and whether it can be written; if it does not answer soon, with the jobs that were
+/// counted last. The other metrics are still useful then.
 pub(in crate::server) async fn text(store: &Store) -> String {
-    match timeout(COUNT_LIMIT, store.count_jobs()).await {
+    let (counted, checked) = tokio::join!(
+        timeout(COUNT_LIMIT, store.count_jobs()),
+        timeout(WRITE_LIMIT, store.check_writable())
+    );
+    match counted {
         Ok(Ok(counts)) => measure_jobs(&counts),
         Ok(Err(error)) => warn!(%error, "could not count the jobs"),
         Err(_) => warn!("could not count the jobs: the store does not answer"),
     }
+    let is_writable = matches!(checked, Ok(Ok(())));
+    if !is_writable {
+        let reason = match checked {
+            Ok(checked) => checked.err().map(|error| error.to_string()),
+            Err(_) => Some("it does not answer".to_owned()),
+        };
+        warn!(reason, "the store cannot be written");
+    }
+    gauge!(metric_names::STORE_WRITABLE).set(f64::from(u8::from(is_writable)));
     telemetry::render()
 }
 

@@ -51,6 +51,7 @@ struct PredictRequest {
     /// The future actions, as many as `steps`. The first acts from the last frame on.
     plan: Option<Vec<Vec<f32>>>,
     /// How many frames to predict. Default: the model's horizon. More are beyond what the model was trained for.
+    #[schema(minimum = 1, maximum = 256)]
     steps: Option<usize>,
     /// The units of actions and state as the client has them: other units than the model's are an error.
     units: Option<Units>,

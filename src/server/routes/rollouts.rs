@@ -51,6 +51,7 @@ struct RolloutRequest {
     /// Plans: sequences of future actions, each with `steps` actions. The first action acts from the last frame on.
     plans: Vec<Vec<Vec<f32>>>,
     /// How many frames to predict. Default: the model's horizon. More are beyond what the model was trained for.
+    #[schema(minimum = 1, maximum = 256)]
     steps: Option<usize>,
 }
 
@@ -66,6 +67,7 @@ struct SessionRolloutRequest {
     /// Plans: sequences of future actions, each with `steps` actions. The first action acts from the last frame on.
     plans: Vec<Vec<Vec<f32>>>,
     /// How many frames to predict. Default: the model's horizon. More are beyond what the model was trained for.
+    #[schema(minimum = 1, maximum = 256)]
     steps: Option<usize>,
 }
 

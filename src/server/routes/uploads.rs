@@ -7,6 +7,7 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use crate::server::http::extract::{Path, Query};
+use crate::server::http::keys::Caller;
 use crate::server::http::problem::{ApiError, unfit};
 use crate::server::state::App;
 use crate::server::token::Token;
@@ -61,6 +62,7 @@ struct Upload {
 )]
 async fn create(
     app: App,
+    caller: Caller,
     Query(query): Query<UploadQuery>,
     headers: HeaderMap,
     body: Body,
@@ -76,7 +78,7 @@ async fn create(
         let right = "the body is the file itself, without a form; send it with curl --data-binary @FILE";
         return Err(ApiError::UnsupportedMedia(right.to_owned()));
     }
-    let bytes = app.uploads.receive(&file, body, &app.blocking).await?;
+    let bytes = app.uploads.receive(&file, caller, body, &app.blocking).await?;
     file.push(app.store().objects()).await.map_err(JobError::Store)?;
     let source = file.to_string();
     Ok((StatusCode::CREATED, axum::Json(Upload { id, source, bytes })))

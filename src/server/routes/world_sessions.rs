@@ -6,7 +6,7 @@ mod bodies;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
-use axum::http::StatusCode;
+use axum::http::{StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use tokio::sync::Mutex;
 use utoipa_axum::router::OpenApiRouter;
@@ -18,7 +18,7 @@ use self::bodies::{
 };
 use crate::server::http::extract::{Json, Path};
 use crate::server::http::keys::Caller;
-use crate::server::http::problem::ApiError;
+use crate::server::http::problem::{ApiError, RETRY_AFTER_S};
 use crate::server::state::App;
 use crate::server::stream::protocol::{ErrorCode, ServerMessage};
 use crate::server::stream::step::StepError;
@@ -43,20 +43,19 @@ pub(in crate::server) fn routes() -> OpenApiRouter<App> {
         (status = 503, description = "All environments are in use"),
     )
 )]
-async fn create(
-    app: App,
-    caller: Caller,
-    Json(request): Json<NewWorldSession>,
-) -> Result<axum::Json<bodies::OpenedWorldSession>, ApiError> {
+async fn create(app: App, caller: Caller, Json(request): Json<NewWorldSession>) -> Result<impl IntoResponse, ApiError> {
     let model = app.predictor().active(&request.model)?;
     let session = WorldSession::new(model, caller)?;
     let created_at = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or(Duration::ZERO);
     let session_id = app.world_sessions.add(Mutex::new(session), caller, Instant::now())?;
-    Ok(axum::Json(bodies::OpenedWorldSession {
+    // For load balancers, which learn from it where the session is.
+    let location = format!("/v1/realtime/sessions/{session_id}");
+    let opened = bodies::OpenedWorldSession {
         session_id,
         mode: request.mode,
         created_at: created_at.as_secs_f64(),
-    }))
+    };
+    Ok(([(header::LOCATION, location)], axum::Json(opened)))
 }
 
 /// Predicts the observations that follow this one. While the context is not full, there is none.
@@ -143,11 +142,12 @@ async fn advance(
 }
 
 fn refused(status: StatusCode, refusal: StepRefusal, step_id: u64, next_step: u64) -> Response {
-    (
-        status,
-        axum::Json(WorldStepAnswer::refused(step_id, next_step, refusal)),
-    )
-        .into_response()
+    let answer = axum::Json(WorldStepAnswer::refused(step_id, next_step, refusal));
+    let mut response = (status, answer).into_response();
+    if status == StatusCode::SERVICE_UNAVAILABLE {
+        response.headers_mut().insert(header::RETRY_AFTER, RETRY_AFTER_S.into());
+    }
+    response
 }
 
 /// Begins a new context: the next step is 0.

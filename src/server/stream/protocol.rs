@@ -192,7 +192,8 @@ pub enum ServerMessage {
         /// For each frame, whether it is beyond what the model was trained for; absent if none is.
         #[serde(default, skip_serializing_if = "Vec::is_empty")]
         beyond_training: Vec<bool>,
-        /// Actions and states out of the range of the training; absent if there are none.
+        /// Actions and states out of the range of the training and, once in a session, each input that the model does not use; absent
+        /// if there are none.
         #[serde(default, skip_serializing_if = "Vec::is_empty")]
         warnings: Vec<String>,
         /// How long it took.

@@ -195,7 +195,7 @@ impl Ownership {
             let missing = core.missing_before(step.seq)?;
             let task = match missing {
                 Some(missing) => {
-                    let task = core.task(step.frame, &step.conditioning, step.is_overtaken, spec);
+                    let task = core.task(step.frame, &step.conditions.conditioning, step.is_overtaken, spec);
                     Some(if missing > 0 { task.after_gap() } else { task })
                 }
                 None => core.repeat_task(spec),
@@ -206,8 +206,10 @@ impl Ownership {
             let mut prediction = predictor.compute(model, task, Some(key)).await?;
             let core = &mut self.inner()?.core;
             if missing.is_some() {
-                core.state.advance(step.seq, &mut prediction, step.conditioning, spec);
+                core.state
+                    .advance(step.seq, &mut prediction, step.conditions.conditioning, spec);
             }
+            core.say_unused(&mut prediction, step.conditions.unused);
             core.keep(step.timestamp_us, missing.unwrap_or(0), prediction)
         } else {
             self.inner()?.core.last_answer(step.timestamp_us)

@@ -13,7 +13,7 @@ use super::protocol::{ClosingReason, ErrorCode};
 use crate::server::blocking::BlockingWork;
 use crate::server::config::ServerConfig;
 use crate::server::http::admission::Admission;
-use crate::server::http::body_budget;
+use crate::server::http::body_budget::{self, BodyBudgetError};
 use crate::server::http::keys::{Caller, Keys};
 use crate::server::http::message_bytes::MessageBytes;
 use crate::server::http::task_limit::TaskLimit;
@@ -81,7 +81,10 @@ pub(super) async fn arrival(
 fn unreadable(error: axum::Error) -> InputEnd {
     let error = error.into_inner();
     if let Some(exceeded) = body_budget::cause(error.as_ref()) {
-        let (reason, code) = (ClosingReason::Overloaded, ErrorCode::Overloaded);
+        let (reason, code) = match exceeded {
+            BodyBudgetError::TooLong { .. } => (ClosingReason::TooLong, ErrorCode::Malformed),
+            BodyBudgetError::Full { .. } => (ClosingReason::Overloaded, ErrorCode::Overloaded),
+        };
         return InputEnd::Unreadable(reason, code, exceeded.to_string());
     }
     let reason = match error.downcast_ref::<tungstenite::Error>() {

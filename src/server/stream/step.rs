@@ -13,7 +13,7 @@ use foreframe_core::nn::ModelSpec;
 use foreframe_core::registry::Manifest;
 use foreframe_core::serving::{
     ConditioningInput, FieldNames, InputError, Prediction, RawConditioning, STEP_FIELDS, ServingError, SessionState,
-    Task,
+    Task, unused_inputs,
 };
 use foreframe_core::types::{Action, RobotState, ValueError};
 
@@ -23,7 +23,7 @@ pub(in crate::server) struct FrameStep {
     pub(in crate::server) seq: u64,
     pub(in crate::server) timestamp_us: i64,
     pub(in crate::server) frame: Frame,
-    pub(in crate::server) conditioning: ConditioningInput,
+    pub(in crate::server) conditions: CheckedConditions,
     pub(in crate::server) format: ImageFormat,
     /// Whether newer frames wait behind this one, so that it may go without a prediction.
     pub(in crate::server) is_overtaken: bool,
@@ -47,12 +47,20 @@ impl FrameStep {
         Ok(Self {
             seq: message.seq,
             timestamp_us: message.timestamp_us,
-            conditioning: conditions.check(&STEP_FIELDS, manifest, max_steps)?,
+            conditions: conditions.check(&STEP_FIELDS, manifest, max_steps)?,
             frame: images::decode("image", message.image, ImageInput { format, resize }, manifest)?,
             format,
             is_overtaken: false,
         })
     }
+}
+
+/// What comes with a frame, if it fits the model.
+#[derive(Clone, Debug)]
+pub(in crate::server) struct CheckedConditions {
+    pub(in crate::server) conditioning: ConditioningInput,
+    /// A warning for each field that the model does not use.
+    pub(in crate::server) unused: Vec<String>,
 }
 
 /// What comes with a frame, as the client sent it.
@@ -64,16 +72,22 @@ pub(in crate::server) struct StepConditions {
 }
 
 impl StepConditions {
-    /// The conditioning input, if it fits the model. `names`: of the fields, for errors.
+    /// The conditioning input, if it fits the model. `names`: of the fields, for errors and warnings.
     pub(in crate::server) fn check(
         self,
         names: &FieldNames,
         manifest: &Manifest,
         max_steps: usize,
-    ) -> Result<ConditioningInput, StepError> {
+    ) -> Result<CheckedConditions, StepError> {
         if let Some(reason) = refused_steps(self.steps, manifest, max_steps) {
             return Err(StepError::Invalid(reason));
         }
+        let (action, plan) = (
+            self.action.is_some().then_some("action"),
+            self.plan.is_some().then_some(names.plan),
+        );
+        let given: Vec<&str> = action.into_iter().chain(plan).collect();
+        let unused = unused_inputs(false, &given, manifest);
         let past: Option<Action> = self.action.map(|action| checked("action", action)).transpose()?;
         let actions = |plan: Vec<Vec<f32>>| plan.into_iter().map(|action| checked(names.plan, action)).collect();
         let plan: Option<Vec<Action>> = self.plan.map(actions).transpose()?;
@@ -84,7 +98,8 @@ impl StepConditions {
             state: state.as_ref(),
             steps: self.steps,
         };
-        Ok(ConditioningInput::new(given, names, manifest)?)
+        let conditioning = ConditioningInput::new(given, names, manifest)?;
+        Ok(CheckedConditions { conditioning, unused })
     }
 }
 
@@ -132,6 +147,8 @@ pub(super) struct SessionCore {
     pub(super) settings: SessionSettings,
     /// `None` before the first frame, and after an import: then the last answer is computed again on request.
     last_answer: Option<StepAnswer>,
+    /// The warnings about inputs that the model does not use, as far as an answer had them.
+    said_unused: Vec<String>,
 }
 
 /// The answer to a frame.
@@ -151,6 +168,7 @@ impl SessionCore {
             state,
             settings,
             last_answer: None,
+            said_unused: Vec::new(),
         }
     }
 
@@ -191,6 +209,17 @@ impl SessionCore {
     pub(super) fn last_answer(&self, timestamp_us: i64) -> StepAnswer {
         let last = self.last_answer.clone();
         last.unwrap_or_else(|| self.answer(timestamp_us, 0, None))
+    }
+
+    /// Adds the warnings about the session's camera and other inputs that the model does not use, each to one answer of the session.
+    pub(super) fn say_unused(&mut self, prediction: &mut Prediction, mut unused: Vec<String>) {
+        if prediction.rollouts.is_empty() {
+            return;
+        }
+        unused.extend(unused_inputs(self.state.camera().is_some(), &[], &prediction.manifest));
+        unused.retain(|warning| !self.said_unused.contains(warning));
+        self.said_unused.extend_from_slice(&unused);
+        prediction.warnings.extend(unused);
     }
 
     /// Keeps the prediction as the answer to the last frame.

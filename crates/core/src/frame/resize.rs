@@ -1,42 +1,31 @@
 //! Resizes a frame of any size to the size that a model takes.
 
-use std::str::FromStr;
-
 use serde::{Deserialize, Serialize};
 
 use super::catmull_rom::{GrayView, resample};
 use super::{Frame, FrameError, check_size};
+use crate::named_enum;
 
-/// How a frame of another shape becomes one of the wanted shape.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize, Serialize)]
-#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
-#[serde(rename_all = "snake_case")]
-pub enum Resize {
-    /// Keeps the proportions and cuts off what does not fit, equally on both sides.
-    Crop,
-    /// Keeps the proportions and the whole picture; adds equal black bars on both sides.
-    Letterbox,
-    /// Keeps the whole picture and changes its proportions.
-    Stretch,
+named_enum! {
+    /// How a frame of another shape becomes one of the wanted shape.
+    #[derive(Deserialize, Serialize)]
+    #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
+    #[serde(rename_all = "snake_case")]
+    pub enum Resize {
+        /// Keeps the proportions and cuts off what does not fit, equally on both sides.
+        Crop = "crop",
+        /// Keeps the proportions and the whole picture; adds equal black bars on both sides.
+        Letterbox = "letterbox",
+        /// Keeps the whole picture and changes its proportions.
+        Stretch = "stretch",
+    }
+    else |name| -> ResizeError { ResizeError(name.to_owned()) }
 }
 
 /// A name that is no way to resize a frame.
 #[derive(Debug, thiserror::Error)]
 #[error("resize is \"{}\"; it must be crop, letterbox or stretch", .0.escape_default())]
 pub struct ResizeError(String);
-
-impl FromStr for Resize {
-    type Err = ResizeError;
-
-    fn from_str(name: &str) -> Result<Self, ResizeError> {
-        match name {
-            "crop" => Ok(Self::Crop),
-            "letterbox" => Ok(Self::Letterbox),
-            "stretch" => Ok(Self::Stretch),
-            other => Err(ResizeError(other.to_owned())),
-        }
-    }
-}
 
 /// The frame at `width_px`×`height_px`, resized with a Catmull-Rom filter (widened when it makes the frame smaller, so
 /// that details do not alias). A frame of that size comes back unchanged. Errors: `Size` if a side is out of range.
@@ -96,8 +85,6 @@ mod tests {
 
     use super::*;
 
-    const WAYS: [Resize; 3] = [Resize::Crop, Resize::Letterbox, Resize::Stretch];
-
     fn flat(width: u32, height: u32, value: u8) -> Frame {
         Frame::new(width, height, vec![value; (width * height) as usize]).unwrap()
     }
@@ -111,7 +98,7 @@ mod tests {
         fn every_way_gives_the_asked_size(
             from in (1u32..90, 1u32..90), to in (1u32..90, 1u32..90), value in any::<u8>(), way in 0usize..3,
         ) {
-            let resized = resize(&flat(from.0, from.1, value), to.0, to.1, WAYS[way]).unwrap();
+            let resized = resize(&flat(from.0, from.1, value), to.0, to.1, Resize::ALL[way]).unwrap();
             prop_assert_eq!((resized.width(), resized.height()), to);
             let is_expected = |&pixel: &u8| pixel.abs_diff(value) <= 1 || (way == 1 && pixel == 0);
             prop_assert!(resized.pixels().iter().all(is_expected));
@@ -121,7 +108,7 @@ mod tests {
     #[test]
     fn a_frame_of_the_right_size_stays_as_it_is() {
         let frame = Frame::new(3, 2, vec![9, 1, 200, 4, 77, 255]).unwrap();
-        for way in WAYS {
+        for way in Resize::ALL {
             assert_eq!(resize(&frame, 3, 2, way).unwrap(), frame);
         }
     }

@@ -3,27 +3,29 @@
 // `pulp` compiles a closure with vector instructions; that includes only functions that are inlined into it.
 #![allow(clippy::inline_always)]
 
-use std::fmt;
-use std::str::FromStr;
-
 use candle_core::{Shape, Tensor};
 use serde::{Deserialize, Serialize};
 
 use super::error::NnError;
 use super::fused::{FusedOperation, Operand, apply};
-use super::options::named_enum;
+use super::options::UnknownName;
 use super::plain::losses;
+use crate::named_enum;
 use crate::vectorized::vectorized;
 
-named_enum!(
+named_enum! {
     /// The loss that training minimizes. The paper found the mean squared error best.
-    Loss, "loss", "\"mse\" and \"l1\"", {
+    #[derive(Hash, Serialize, Deserialize)]
+    #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
+    #[serde(rename_all = "kebab-case")]
+    pub enum Loss {
         /// Mean of the squared differences.
         Mse = "mse",
         /// Mean of the absolute differences.
         L1 = "l1",
     }
-);
+    else |name| -> UnknownName { UnknownName::new("loss", name, "\"mse\" and \"l1\"") }
+}
 
 impl Loss {
     /// The loss as a scalar tensor. Only `prediction` gets a gradient. Errors: `Shape` if the shapes differ.

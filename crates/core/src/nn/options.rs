@@ -1,9 +1,8 @@
 //! The options of a model that have names: in manifests, in settings and in messages.
 
-use std::fmt;
-use std::str::FromStr;
-
 use serde::{Deserialize, Serialize};
+
+use crate::named_enum;
 
 /// No value of an enumeration has this name.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
@@ -17,41 +16,19 @@ pub struct UnknownName {
     pub known: &'static str,
 }
 
-/// An enumeration whose values have one name each, in JSON, on the command line and in messages.
-macro_rules! named_enum {
-    ($(#[$attribute:meta])* $name:ident, $kind:literal, $known:literal, { $($(#[$vdoc:meta])* $variant:ident = $text:literal),+ $(,)? }) => {
-        #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
-        #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
-        #[serde(rename_all = "kebab-case")]
-        $(#[$attribute])*
-        pub enum $name {
-            $($(#[$vdoc])* $variant,)+
-        }
-
-        impl fmt::Display for $name {
-            fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-                f.pad(match self { $(Self::$variant => $text,)+ })
-            }
-        }
-
-        impl FromStr for $name {
-            type Err = $crate::nn::options::UnknownName;
-
-            fn from_str(name: &str) -> Result<Self, Self::Err> {
-                match name {
-                    $($text => Ok(Self::$variant),)+
-                    _ => Err($crate::nn::options::UnknownName { kind: $kind, name: name.to_owned(), known: $known }),
-                }
-            }
-        }
-    };
+impl UnknownName {
+    pub(super) fn new(kind: &'static str, name: &str, known: &'static str) -> Self {
+        let name = name.to_owned();
+        Self { kind, name, known }
+    }
 }
-pub(in crate::nn) use named_enum;
 
-named_enum!(
+named_enum! {
     /// The kind of network.
-    #[cfg_attr(feature = "schema", schema(as = Architecture))]
-    ArchitectureKind, "architecture", "\"dense\", \"flow\" and \"sprites\"", {
+    #[derive(Hash, Serialize, Deserialize)]
+    #[cfg_attr(feature = "schema", derive(utoipa::ToSchema), schema(as = Architecture))]
+    #[serde(rename_all = "kebab-case")]
+    pub enum ArchitectureKind {
         /// The paper's: a dense codec and LSTMs.
         Dense = "dense",
         /// A convolutional network that moves the pixels of the last frame.
@@ -59,7 +36,8 @@ named_enum!(
         /// A network that moves two pictures, each as a whole.
         Sprites = "sprites",
     }
-);
+    else |name| -> UnknownName { UnknownName::new("architecture", name, "\"dense\", \"flow\" and \"sprites\"") }
+}
 
 impl ArchitectureKind {
     /// The architecture of specifications that name none.
@@ -74,25 +52,33 @@ impl ArchitectureKind {
     }
 }
 
-named_enum!(
+named_enum! {
     /// The paper's two approaches to reconstruct the context frames.
-    Reconstruction, "reconstruction", "\"sequence\" and \"stepwise\"", {
+    #[derive(Hash, Serialize, Deserialize)]
+    #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
+    #[serde(rename_all = "kebab-case")]
+    pub enum Reconstruction {
         /// Encodes the whole sequence, then decodes it (approach 1).
         Sequence = "sequence",
         /// Reconstructs after each frame (approach 2).
         Stepwise = "stepwise",
     }
-);
+    else |name| -> UnknownName { UnknownName::new("reconstruction", name, "\"sequence\" and \"stepwise\"") }
+}
 
-named_enum!(
+named_enum! {
     /// What the dense network's predictor gives at each step. The paper does not add its output to the last features.
-    PredictorOutput, "predictor output", "\"residual\" and \"absolute\"", {
+    #[derive(Hash, Serialize, Deserialize)]
+    #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
+    #[serde(rename_all = "kebab-case")]
+    pub enum PredictorOutput {
         /// The change of the features since the previous frame.
         Residual = "residual",
         /// The features themselves, as in the paper.
         Absolute = "absolute",
     }
-);
+    else |name| -> UnknownName { UnknownName::new("predictor output", name, "\"residual\" and \"absolute\"") }
+}
 
 impl PredictorOutput {
     /// That of specifications that name none.
@@ -107,9 +93,12 @@ impl PredictorOutput {
     }
 }
 
-named_enum!(
+named_enum! {
     /// The inputs of a prediction besides the context frames.
-    Conditioning, "conditioning", "\"none\", \"action\", \"state\" and \"state-action\"", {
+    #[derive(Hash, Serialize, Deserialize)]
+    #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
+    #[serde(rename_all = "kebab-case")]
+    pub enum Conditioning {
         /// No further inputs.
         None = "none",
         /// The action that leads to each predicted frame.
@@ -119,7 +108,10 @@ named_enum!(
         /// The action that leads to each predicted frame, and the state at the last context frame.
         StateAction = "state-action",
     }
-);
+    else |name| -> UnknownName {
+        UnknownName::new("conditioning", name, "\"none\", \"action\", \"state\" and \"state-action\"")
+    }
+}
 
 impl Conditioning {
     /// Whether the inputs include actions.

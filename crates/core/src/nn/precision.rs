@@ -1,36 +1,35 @@
 //! The precision of products with weights in predictions. The program chooses it once, when it starts; without a choice it is single
 //! precision. Trainings, and predictions on a graphics card, are always in single precision.
 
-use std::fmt;
-use std::str::FromStr;
 use std::sync::OnceLock;
 
 use serde::{Deserialize, Serialize};
 
 use super::error::NnError;
+use crate::named_enum;
 
 /// The chosen precision.
 static CHOSEN: OnceLock<Precision> = OnceLock::new();
 
-/// The numbers in which predictions multiply inputs with weights. A few layers take more bits. Sums of bytes
-/// are exact whole numbers; all else is in single precision.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(try_from = "String", into = "String")]
-pub enum Precision {
-    /// Single precision, 32 bits.
-    #[default]
-    F32,
-    /// bfloat16: 16 bits, of which 8 are the exponent.
-    Bf16,
-    /// Whole numbers of 8 bits with factors: one for each output of the weights, and one for each item of the inputs. With AVX2, weights
-    /// have 7 bits.
-    Int8,
+named_enum! {
+    /// The numbers in which predictions multiply inputs with weights. A few layers take more bits. Sums of bytes
+    /// are exact whole numbers; all else is in single precision.
+    #[derive(Default, Serialize, Deserialize)]
+    #[serde(try_from = "String", into = "String")]
+    pub enum Precision {
+        /// Single precision, 32 bits.
+        #[default]
+        F32 = "f32",
+        /// bfloat16: 16 bits, of which 8 are the exponent.
+        Bf16 = "bf16",
+        /// Whole numbers of 8 bits with factors: one for each output of the weights, and one for each item of the inputs. With AVX2, weights
+        /// have 7 bits.
+        Int8 = "int8",
+    }
+    else |text| -> String { format!("unknown precision \"{text}\"; a precision is \"f32\", \"bf16\" or \"int8\"") }
 }
 
 impl Precision {
-    /// All, from the most to the fewest bits.
-    pub const ALL: [Self; 3] = [Self::F32, Self::Bf16, Self::Int8];
-
     /// Whether this processor multiplies such numbers. For bf16 and int8 it must have instructions for it: without them, these would be
     /// slower than single precision. With AVX2 and without AVX-512 VNNI, int8 is for dense networks only: the others stay in single
     /// precision.
@@ -99,25 +98,6 @@ impl Precision {
             Self::Int8 if cfg!(target_arch = "aarch64") => "dot products of bytes (ARM's \"asimddp\")",
             Self::Int8 => "AVX2",
         }
-    }
-}
-
-impl fmt::Display for Precision {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            Self::F32 => "f32",
-            Self::Bf16 => "bf16",
-            Self::Int8 => "int8",
-        })
-    }
-}
-
-impl FromStr for Precision {
-    type Err = String;
-
-    fn from_str(text: &str) -> Result<Self, String> {
-        let named = Self::ALL.into_iter().find(|precision| precision.to_string() == text);
-        named.ok_or_else(|| format!("unknown precision \"{text}\"; a precision is \"f32\", \"bf16\" or \"int8\""))
     }
 }
 

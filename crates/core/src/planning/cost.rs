@@ -6,31 +6,34 @@ use super::goal::Goal;
 use super::limits::ActionLimits;
 use crate::frame::preprocess::scale;
 use crate::frame::quality::mse;
+use crate::named_enum;
 use crate::serving::Rollout;
 
 /// Added to the clearance that is lacking where the robot would touch something, in metres.
 const TOUCH_M: f32 = 1.0;
 
-/// One of the costs.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
-#[serde(rename_all = "snake_case")]
-pub enum PlanCost {
-    /// Distance from the plan's end to the goal's position, in metres.
-    GoalDistance,
-    /// Angle between the heading at the plan's end and the goal's, in radians.
-    GoalHeading,
-    /// Root of the mean squared difference between the last predicted frame and the goal's image, intensities 0…1. In the simulator,
-    /// pixels pick the right plan as often as a codec's features, and more often than blurred pixels (`tests/it/goal_image.rs`).
-    GoalImage,
-    /// What is lacking to the wanted clearance where the way is narrowest, in metres; 1 m more if the robot would touch something.
-    Clearance,
-    /// Mean squared change of the actions from step to step, as a share of their range.
-    Smoothness,
-    /// Mean over the steps of the upper end of the 90 % band of the expected error, intensities 0…1.
-    ExpectedError,
-    /// How unlike the training data the context is, 0…1. The same for all plans of a context.
-    Novelty,
+named_enum! {
+    /// One of the costs.
+    #[derive(PartialOrd, Ord, Serialize, Deserialize)]
+    #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
+    #[serde(rename_all = "snake_case")]
+    pub enum PlanCost {
+        /// Distance from the plan's end to the goal's position, in metres.
+        GoalDistance = "goal_distance",
+        /// Angle between the heading at the plan's end and the goal's, in radians.
+        GoalHeading = "goal_heading",
+        /// Root of the mean squared difference between the last predicted frame and the goal's image, intensities 0…1. In the simulator,
+        /// pixels pick the right plan as often as a codec's features, and more often than blurred pixels (`tests/it/goal_image.rs`).
+        GoalImage = "goal_image",
+        /// What is lacking to the wanted clearance where the way is narrowest, in metres; 1 m more if the robot would touch something.
+        Clearance = "clearance",
+        /// Mean squared change of the actions from step to step, as a share of their range.
+        Smoothness = "smoothness",
+        /// Mean over the steps of the upper end of the 90 % band of the expected error, intensities 0…1.
+        ExpectedError = "expected_error",
+        /// How unlike the training data the context is, 0…1. The same for all plans of a context.
+        Novelty = "novelty",
+    }
 }
 
 /// A cost with its weight.
@@ -43,31 +46,6 @@ pub struct CostTerm {
 }
 
 impl PlanCost {
-    /// All costs.
-    pub const ALL: [Self; 7] = [
-        Self::GoalDistance,
-        Self::GoalHeading,
-        Self::GoalImage,
-        Self::Clearance,
-        Self::Smoothness,
-        Self::ExpectedError,
-        Self::Novelty,
-    ];
-
-    /// Its name, in requests and answers.
-    #[must_use]
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::GoalDistance => "goal_distance",
-            Self::GoalHeading => "goal_heading",
-            Self::GoalImage => "goal_image",
-            Self::Clearance => "clearance",
-            Self::Smoothness => "smoothness",
-            Self::ExpectedError => "expected_error",
-            Self::Novelty => "novelty",
-        }
-    }
-
     /// Its unit; empty where it has none.
     #[must_use]
     pub fn unit(self) -> &'static str {

@@ -10,21 +10,25 @@ use super::error::PlanError;
 use super::goal::Goal;
 use super::limits::ActionLimit;
 use super::solver::{Cem, Mppi, NOISE_COLOR, RandomShooting, SearchSpace, Solver};
+use crate::named_enum;
 use crate::registry::Manifest;
 use crate::types::Seed;
 
-/// How the next plans are chosen.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
-#[serde(rename_all = "kebab-case")]
-pub enum SolverKind {
-    /// Plans from the whole range, without learning.
-    RandomShooting,
-    /// The cross-entropy method, with coloured noise and kept elites (iCEM).
-    #[default]
-    Cem,
-    /// Model predictive path integral control, from the present plan on.
-    Mppi,
+named_enum! {
+    /// How the next plans are chosen.
+    #[derive(Default, Serialize, Deserialize)]
+    #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
+    #[serde(rename_all = "kebab-case")]
+    pub enum SolverKind {
+        /// Plans from the whole range, without learning.
+        RandomShooting = "random-shooting",
+        /// The cross-entropy method, with coloured noise and kept elites (iCEM).
+        #[default]
+        Cem = "cem",
+        /// Model predictive path integral control, from the present plan on.
+        Mppi = "mppi",
+    }
+    else |name| -> String { format!("there is no solver {name:?}; there are: {}", Self::ALL.map(Self::name).join(", ")) }
 }
 
 /// How plans are drawn.

@@ -31,7 +31,10 @@ pub enum ServingError {
         retry_after_s: u64,
     },
     /// The request waited longer than its limit.
-    #[error("no prediction within {limit_ms} ms; the server is overloaded")]
+    #[error(
+        "no prediction within {limit_ms} ms (setting prediction_deadline_ms): the server is overloaded, or the request asks for too many \
+         plans or steps"
+    )]
     Deadline {
         /// The time limit of a request, in milliseconds.
         limit_ms: u128,

@@ -3,7 +3,7 @@
 use super::conditioning::{ConditioningInput, REQUEST_FIELDS, RawConditioning, past_states_used};
 use super::error::InputError;
 use super::ranges::range_warnings;
-use super::task::{Task, check_frames, unused};
+use super::task::{Task, check_frames, unused_inputs};
 use crate::frame::Frame;
 use crate::frame::warp::CameraModel;
 use crate::registry::Manifest;
@@ -64,9 +64,17 @@ impl PredictionInput {
     /// What in the input the model does not use, and what is out of the range that it saw in training, if the manifest has
     /// ranges. Errors: as [`PredictionInput::check`].
     pub fn warnings(&self, manifest: &Manifest) -> Result<Vec<String>, InputError> {
-        let mut warnings = unused(self.camera.is_some(), self.plan.is_some(), manifest);
+        let mut warnings = self.unused(manifest);
         warnings.extend(range_warnings(manifest, &[self.conditioning(manifest)?]));
         Ok(warnings)
+    }
+
+    /// What in the input the model does not use.
+    fn unused(&self, manifest: &Manifest) -> Vec<String> {
+        let actions = (!self.actions.is_empty()).then_some("actions");
+        let plan = self.plan.is_some().then_some("plan");
+        let fields: Vec<&str> = actions.into_iter().chain(plan).collect();
+        unused_inputs(self.camera.is_some(), &fields, manifest)
     }
 
     /// The input as a task with one rollout. Errors: as [`PredictionInput::check`].
@@ -74,7 +82,7 @@ impl PredictionInput {
     pub fn into_task(self, manifest: &Manifest) -> Result<Task, InputError> {
         Ok(Task {
             conditioning_inputs: vec![self.checked(manifest)?],
-            warnings: unused(self.camera.is_some(), self.plan.is_some(), manifest),
+            warnings: self.unused(manifest),
             past_states: past_states_used(self.past_states, manifest)?,
             camera: self.camera,
             frames: self.frames,

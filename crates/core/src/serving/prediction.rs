@@ -28,7 +28,7 @@ pub struct Prediction {
     /// estimates no depth.
     #[doc(hidden)]
     pub occupancy: Option<Occupancy>,
-    /// Actions and states out of the range of the training.
+    /// What of the input the model does not use, and actions and states out of the range of the training.
     pub warnings: Vec<String>,
     /// How long it took.
     pub timing: Timing,

@@ -105,6 +105,7 @@ pub struct SessionSnapshot {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub camera: Option<CameraModel>,
     /// How many frames the last prediction had; absent: the model's horizon.
+    #[cfg_attr(feature = "schema", schema(minimum = 1, maximum = 256))]
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub steps: Option<usize>,
     /// Of each predicted step, how large its errors were so far: the sum of the natural logarithms of the errors over the middles of their

@@ -48,7 +48,7 @@ impl Task {
         check_frames(&frames, manifest)?;
         Ok(Self {
             past_states: past_states_used(past_states, manifest)?,
-            warnings: unused(camera.is_some(), false, manifest),
+            warnings: unused_inputs(camera.is_some(), &[], manifest),
             camera,
             frames,
             conditioning_inputs,
@@ -103,8 +103,9 @@ impl Task {
     }
 }
 
-/// A warning for a camera and for a plan that are given but not used by the model.
-pub(super) fn unused(has_camera: bool, has_plan: bool, manifest: &Manifest) -> Vec<String> {
+/// A warning for a camera, and for each of the fields with actions that are given, if the model does not use it.
+#[must_use]
+pub fn unused_inputs(has_camera: bool, action_fields: &[&str], manifest: &Manifest) -> Vec<String> {
     let (model, spec) = (&manifest.name, &manifest.spec);
     let mut warnings = Vec::new();
     if has_camera && !spec.flow().is_some_and(|flow| flow.layers.depth) {
@@ -112,8 +113,9 @@ pub(super) fn unused(has_camera: bool, has_plan: bool, manifest: &Manifest) -> V
             "camera is not used: the model \"{model}\" does not estimate depth"
         ));
     }
-    if has_plan && spec.action_inputs().is_none() {
-        warnings.push(format!("plan is not used: the model \"{model}\" takes no actions"));
+    if spec.action_inputs().is_none() {
+        let unused = |field| format!("{field} is not used: the model \"{model}\" takes no actions");
+        warnings.extend(action_fields.iter().map(unused));
     }
     warnings
 }

@@ -123,8 +123,8 @@ pub enum DatasetError {
         /// Each argument that differs, with both values.
         differences: String,
     },
-    /// Another collection is writing to the directory.
-    #[error("another collection is running in {}; wait until it ends or use another directory", .0.display())]
+    /// Another process is writing to the directory.
+    #[error("another collection or import is running in {}; wait until it ends or use another directory", .0.display())]
     Busy(PathBuf),
     /// The collection was stopped before it was complete.
     #[error("stopped after {done} of {total} trials were saved; run the same command again to resume")]

@@ -3,6 +3,7 @@
 //! A source (`images`, `donkeycar`, `lerobot`, `numpy`, `npz`, `video` or `bag`) lists its records: time, action, state and where the image
 //! is. `archive` unpacks a source that is one. `timing` cuts them into episodes at one frame rate. `encoder` reads the images and
 //! resizes them, `writer` writes shards. `part` saves some of the shards for another process, by `saved_shards`.
+//! `shard_origins` tells which shards of an import that was stopped are still of use.
 //! Only one shard is in memory at a time.
 
 mod archive;
@@ -21,7 +22,9 @@ mod options;
 mod part;
 mod raw_images;
 mod recording;
+mod rounding;
 mod saved_shards;
+mod shard_origins;
 mod skipped;
 mod timing;
 mod video;
@@ -127,6 +130,8 @@ fn plan(source: &Path, config: &ImportConfig, cancelled: &AtomicBool) -> Result<
     check_channels(&recording)?;
     check_units(options, &recording)?;
     let mut plan = timing::plan(recording, options)?;
+    let notes = rounding::notes(&plan);
+    plan.recording.notes.extend(notes);
     camera::describe(&mut plan, options, cancelled)?;
     Ok(plan)
 }

@@ -71,6 +71,20 @@ impl DatasetInfo {
         simulated.map(CameraConfig::model_with_height).or(self.camera)
     }
 
+    /// What the content hash leaves out of what a model is trained for: camera, channels, frame size and period, as JSON in one
+    /// line.
+    #[doc(hidden)]
+    #[must_use]
+    pub fn description(&self) -> String {
+        let described = (
+            self.camera,
+            &self.action_channels,
+            &self.state_channels,
+            (self.frame_width_px, self.frame_height_px, self.frame_period_s),
+        );
+        serde_json::to_string(&described).expect("a description that JSON cannot hold is a bug")
+    }
+
     /// Number of frames and masks.
     pub(super) fn image_count(&self) -> usize {
         self.frame_count * (1 + usize::from(self.has_masks))

@@ -141,6 +141,22 @@ impl Dataset {
         self.parts.clone()
     }
 
+    /// The descriptions of the parts ([`DatasetInfo::description`]), one a line.
+    #[doc(hidden)]
+    #[must_use]
+    pub fn description(&self) -> String {
+        let parts = self.parts();
+        let descriptions = parts.iter().map(|part| part.info.description());
+        descriptions.collect::<Vec<_>>().join("\n")
+    }
+
+    /// Whether a part has a camera that the whole has not, because the parts do not have the same.
+    #[doc(hidden)]
+    #[must_use]
+    pub fn lost_camera(&self) -> bool {
+        self.info.camera.is_none() && self.parts.iter().any(|part| part.info.camera.is_some())
+    }
+
     /// The description of the part that this episode belongs to.
     fn info_of(&self, episode: usize) -> &DatasetInfo {
         let part = self.parts.iter().find(|part| part.episodes.contains(&episode));

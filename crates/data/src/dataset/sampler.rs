@@ -1,6 +1,5 @@
 //! Divides a data set into training, validation and test parts: by complete trials with a seed, and by time for recordings.
 
-use std::fmt;
 use std::ops::Range;
 
 use rand::Rng;
@@ -8,6 +7,7 @@ use rand::seq::index;
 
 use super::check::check_counts;
 use super::{Dataset, DatasetError, Episode};
+use foreframe_core::named_enum;
 use foreframe_core::types::Seed;
 use foreframe_sim::TrialParameters;
 
@@ -21,41 +21,20 @@ pub(crate) const WINDOW_FRAMES: usize = 10;
 /// Trials are split in blocks of ten: eight for training, one for validation, one for testing.
 const BLOCK: u64 = 10;
 
-/// A part of the data with one purpose.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-pub enum Split {
-    /// For fitting the weights.
-    Train,
-    /// For selecting weights and settings.
-    Validation,
-    /// For the final scores: trials that training never uses.
-    Test,
-    /// Trials with a start/goal pair that training never uses; empty for recordings.
-    UnseenPairs,
-    /// Trials with a PID gain that training never uses, and with one of its start/goal pairs; empty for recordings.
-    UnseenGains,
-}
-
-impl Split {
-    /// All splits, in the order of declaration.
-    pub const ALL: [Self; 5] = [
-        Self::Train,
-        Self::Validation,
-        Self::Test,
-        Self::UnseenPairs,
-        Self::UnseenGains,
-    ];
-
-    /// `train`, `validation`, `test`, `unseen-pairs` or `unseen-gains`.
-    #[must_use]
-    pub fn name(self) -> &'static str {
-        ["train", "validation", "test", "unseen-pairs", "unseen-gains"][self as usize]
-    }
-}
-
-impl fmt::Display for Split {
-    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
-        formatter.write_str(self.name())
+named_enum! {
+    /// A part of the data with one purpose.
+    #[derive(Hash)]
+    pub enum Split {
+        /// For fitting the weights.
+        Train = "train",
+        /// For selecting weights and settings.
+        Validation = "validation",
+        /// For the final scores: trials that training never uses.
+        Test = "test",
+        /// Trials with a start/goal pair that training never uses; empty for recordings.
+        UnseenPairs = "unseen-pairs",
+        /// Trials with a PID gain that training never uses, and with one of its start/goal pairs; empty for recordings.
+        UnseenGains = "unseen-gains",
     }
 }
 

@@ -5,6 +5,7 @@ use serde::Serialize;
 use super::histogram::Histogram;
 use super::numbers::number;
 use crate::dataset::Dataset;
+use foreframe_core::nn::spec::MIN_CHANNEL_STD;
 use foreframe_core::types::Channel;
 
 const BINS: usize = 40;
@@ -13,6 +14,8 @@ const MOST_FRAMES: f64 = 0.95;
 /// The share of the frames with the least values, and of those with the greatest, that can be outliers. Since `MOST_FRAMES` are not
 /// equal, the others have a range.
 const OUTER_FRAMES: f64 = 0.02;
+/// In a short recording, these are so many on each side, or a tenth if that is less: wrong values seldom come alone.
+const LEAST_OUTER_FRAMES: usize = 2;
 /// Warn if a value is further from those of the other frames than this many times their range.
 const FAR_RANGES: f64 = 5.0;
 
@@ -53,7 +56,7 @@ pub struct ChannelSummary {
     pub commonest: f64,
     /// Share of the frames with that value, 0 to 1.
     pub commonest_share: f64,
-    /// Least value of the frames without the least and the greatest 2 %.
+    /// Least value of the frames without the least and the greatest 2 % (at least 2 frames each, or a tenth if that is less).
     pub inner_min: f64,
     /// Greatest value of these frames.
     pub inner_max: f64,
@@ -86,6 +89,7 @@ fn summary(role: ChannelRole, channel: &Channel, mut values: Vec<f64>) -> Channe
     let histogram = Histogram::of(values.iter().copied(), BINS);
     let (commonest, frames) = commonest(&mut values);
     let outer = (values.len() as f64 * OUTER_FRAMES).ceil() as usize;
+    let outer = outer.max(LEAST_OUTER_FRAMES.min(values.len() / 10));
     let inner = values
         .get(outer..values.len().saturating_sub(outer))
         .unwrap_or_default();
@@ -128,7 +132,15 @@ pub(super) fn warnings(channels: &[ChannelSummary]) -> Vec<String> {
         ));
     }
     warnings.extend(channels.iter().filter_map(ChannelSummary::warning));
+    warnings.extend(channels.iter().filter_map(ChannelSummary::smallness));
     warnings
+}
+
+/// A sentence on each channel of a data set that varies so little that networks see it too small.
+#[doc(hidden)]
+#[must_use]
+pub fn small_channels(dataset: &Dataset) -> Vec<String> {
+    of(dataset).iter().filter_map(ChannelSummary::smallness).collect()
 }
 
 impl ChannelSummary {
@@ -136,6 +148,20 @@ impl ChannelSummary {
     #[must_use]
     pub fn is_constant(&self) -> bool {
         self.min == self.max
+    }
+
+    fn smallness(&self) -> Option<String> {
+        let least = f64::from(MIN_CHANNEL_STD);
+        (!self.is_constant() && self.std < least).then(|| {
+            format!(
+                "The standard deviation of the {} \"{}\" is {}. The networks divide by the deviation, but at least by 0.001, so \
+                 they see this channel {} times too small. Give it in a smaller unit before you import it, such as mm for m.",
+                self.role,
+                self.name,
+                number(self.std),
+                number(least / self.std)
+            )
+        })
     }
 
     fn warning(&self) -> Option<String> {
@@ -191,10 +217,35 @@ mod tests {
     }
 
     #[test]
+    fn two_outliers_on_one_side_of_a_short_recording_are_found() {
+        for frames in [20, 30, 50, 300] {
+            let wave = move |frame: i32| (f64::from(frame) * 0.3).sin();
+            let with_outliers = (0..frames).map(|frame| if [7, 12].contains(&frame) { 1000.0 } else { wave(frame) });
+            let warning = warned(with_outliers).unwrap();
+            assert!(warning.contains(" to 1000, but most are from -"), "{warning}");
+        }
+    }
+
+    #[test]
+    fn a_channel_that_varies_too_little_for_the_networks_is_found() {
+        let found = |size: f64| {
+            let values = (0..300).map(|frame| size * (f64::from(frame) * 0.3).sin()).collect();
+            summary(ChannelRole::Action, &Channel::new("turn", ""), values).smallness()
+        };
+        let warning = found(1e-4).unwrap();
+        assert!(
+            warning.contains("\"turn\" is 7.1e-5.") && warning.contains("14.1"),
+            "{warning}"
+        );
+        assert_eq!([found(0.0), found(0.01)], [None, None]);
+    }
+
+    #[test]
     fn rare_commands_are_no_outliers() {
         let pulses = |one_of: i32, frames: i32| (0..frames).map(move |frame| f64::from(u8::from(frame % one_of == 0)));
         assert_eq!(warned(pulses(10, 400)), None);
         assert_eq!(warned(pulses(15, 3000)), None);
+        assert_eq!(warned(pulses(10, 20)), None);
         assert_eq!(warned([0.3; 400]), None);
         assert_eq!(warned([0.0, 0.0, 7.0]), None);
     }

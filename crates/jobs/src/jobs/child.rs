@@ -28,6 +28,8 @@ pub const COMMAND: &str = "run-job";
 const POLL_EVERY: Duration = Duration::from_millis(20);
 /// A cancelled child that has not stopped after this time is killed.
 const CANCEL_GRACE: Duration = Duration::from_secs(8);
+/// The format of log lines, which a child needs before it reads its order.
+const LOG_FORMAT: &str = "FOREFRAME_LOG_FORMAT";
 /// After how many milliseconds the allocator gives freed memory back; -1: never.
 const PURGE_DELAY: &str = "MIMALLOC_PURGE_DELAY";
 
@@ -42,6 +44,8 @@ pub struct JobProcess {
     pub models_dir: PathBuf,
     /// What a job can use.
     pub resources: JobResources,
+    /// The format of its log lines: `text` or `json`.
+    pub log_format: String,
 }
 
 /// What the parent writes to the child's standard input, in one line.
@@ -109,7 +113,8 @@ impl ChildExecutor {
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
             // The allocator must not reserve more memory than the limit at its start.
-            .env("MIMALLOC_ARENA_EAGER_COMMIT", "0");
+            .env("MIMALLOC_ARENA_EAGER_COMMIT", "0")
+            .env(LOG_FORMAT, &self.process.log_format);
         // A job keeps freed memory until it ends: the next step of a training needs it again.
         if std::env::var_os(PURGE_DELAY).is_none() {
             command.env(PURGE_DELAY, "-1");

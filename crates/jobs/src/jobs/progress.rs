@@ -24,7 +24,7 @@ pub struct JobProgress {
     pub rate_per_s: Option<f64>,
     /// Seconds left at that rate.
     pub remaining_s: Option<f64>,
-    /// What the job is doing.
+    /// What the job is doing, or what it waits for.
     pub message: String,
 }
 
@@ -56,6 +56,8 @@ pub(super) enum ReportEvent {
     Stage,
     /// The latest losses.
     Losses(Losses),
+    /// What the job waits for; `None` once it goes on.
+    Waiting(Option<String>),
     /// A line for the log.
     Line(String),
     /// A point of the loss curves.
@@ -76,6 +78,8 @@ pub(super) struct ReportBuffer {
     checkpoint: u64,
     /// How often something new was reported.
     changes: u64,
+    /// What the job did before it began to wait.
+    before_wait: Option<String>,
 }
 
 impl ReportBuffer {
@@ -103,6 +107,7 @@ impl ReportBuffer {
                 last.train = losses.train.or(last.train);
                 last.validation = losses.validation.or(last.validation);
             }
+            ReportEvent::Waiting(reason) => self.set_waiting(reason),
             ReportEvent::Line(line) => {
                 self.changes += 1;
                 push(&mut self.lines, (now_s, line));
@@ -118,7 +123,21 @@ impl ReportBuffer {
         }
     }
 
+    fn set_waiting(&mut self, reason: Option<String>) {
+        let progress = &mut self.stored.progress;
+        let Some(reason) = reason else {
+            if let Some(before) = self.before_wait.take() {
+                progress.message = before;
+            }
+            return;
+        };
+        progress.remaining_s = None;
+        let before = std::mem::replace(&mut progress.message, format!("waiting for the store: {reason}"));
+        self.before_wait.get_or_insert(before);
+    }
+
     fn set_progress(&mut self, done: u64, total: u64, message: String, now_s: f64) {
+        self.before_wait = None;
         let last = &self.stored.progress;
         // Without a total nothing is measured yet; fewer units than before belong to new work.
         if total == 0 || total != last.total || done < last.done {
@@ -231,6 +250,22 @@ mod tests {
         buffer.progress(2, 9, "sequence", 3.0);
         buffer.line("a line", 4.0);
         assert_eq!(buffer.changes(), reported + 2);
+    }
+
+    #[test]
+    fn a_waiting_job_says_for_what_until_it_goes_on() {
+        let mut buffer = ReportBuffer::default();
+        let message = |buffer: &ReportBuffer| buffer.stored().progress.message.clone();
+        buffer.progress(1, 9, "sequence", 1.0);
+        buffer.apply(ReportEvent::Waiting(Some("the disk is full".to_owned())), 2.0);
+        assert_eq!(message(&buffer), "waiting for the store: the disk is full");
+        buffer.apply(ReportEvent::Waiting(None), 3.0);
+        assert_eq!(message(&buffer), "sequence");
+        // What was reported meanwhile stays.
+        buffer.apply(ReportEvent::Waiting(Some("the disk is full".to_owned())), 4.0);
+        buffer.progress(2, 9, "evaluation", 5.0);
+        buffer.apply(ReportEvent::Waiting(None), 6.0);
+        assert_eq!(message(&buffer), "evaluation");
     }
 
     #[test]

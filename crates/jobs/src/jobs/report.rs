@@ -68,6 +68,11 @@ impl JobReporter {
         self.apply(ReportEvent::Losses(Losses { train, validation }));
     }
 
+    /// Sets what the job waits for; `None` once it goes on.
+    pub(super) fn waiting(&self, reason: Option<String>) {
+        self.apply(ReportEvent::Waiting(reason));
+    }
+
     /// Adds a line to the job's log.
     pub fn line(&self, line: String) {
         self.apply(ReportEvent::Line(line));

@@ -47,11 +47,23 @@ impl RetryPolicy<'_> {
         self.repeat(|| retry_while_busy(&mut work, is_busy, self.cancelled))
     }
 
-    /// The same for work that blocks.
-    pub(super) fn repeat<T, E: HasErrorKind>(&self, mut work: impl FnMut() -> Result<T, E>) -> Result<T, JobFailure> {
+    /// The same for work that blocks. While it waits, the job's progress says for what.
+    pub(super) fn repeat<T, E: HasErrorKind>(&self, work: impl FnMut() -> Result<T, E>) -> Result<T, JobFailure> {
+        let mut away_since = None;
+        let done = self.repeat_while_away(work, &mut away_since);
+        if away_since.is_some() {
+            self.report.waiting(None);
+        }
+        done
+    }
+
+    /// `away_since`: since when the store is away.
+    fn repeat_while_away<T, E: HasErrorKind>(
+        &self,
+        mut work: impl FnMut() -> Result<T, E>,
+        away_since: &mut Option<Instant>,
+    ) -> Result<T, JobFailure> {
         let mut pause = FIRST_PAUSE;
-        // Since when the store is away.
-        let mut away_since: Option<Instant> = None;
         loop {
             let began = Instant::now();
             let error = match work() {
@@ -67,7 +79,8 @@ impl RetryPolicy<'_> {
             if away_since.is_none() {
                 warn!(reason, "a job waits for the store");
                 self.report.line(format!("waiting for the store: {reason}"));
-                (away_since, pause) = (Some(Instant::now()), FIRST_PAUSE);
+                self.report.waiting(Some(reason));
+                (*away_since, pause) = (Some(Instant::now()), FIRST_PAUSE);
             }
             let paused = Instant::now();
             while paused.elapsed() < pause {

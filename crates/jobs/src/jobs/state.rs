@@ -1,24 +1,30 @@
 //! The states of a job and the transitions between them, as a pure function.
 
 use std::fmt;
-use std::str::FromStr;
 
+use foreframe_core::named_enum;
 use serde::{Deserialize, Serialize};
 
-/// The state of a job.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, utoipa::ToSchema)]
-#[serde(rename_all = "snake_case")]
-pub enum JobState {
-    /// Waits for a worker.
-    Queued,
-    /// A worker runs it.
-    Running,
-    /// Ended with its result.
-    Succeeded,
-    /// Ended with an error.
-    Failed,
-    /// Ended by request.
-    Cancelled,
+named_enum! {
+    /// The state of a job.
+    #[derive(Serialize, Deserialize, utoipa::ToSchema)]
+    #[serde(rename_all = "snake_case")]
+    pub enum JobState {
+        /// Waits for a worker.
+        Queued = "queued",
+        /// A worker runs it.
+        Running = "running",
+        /// Ended with its result.
+        Succeeded = "succeeded",
+        /// Ended with an error.
+        Failed = "failed",
+        /// Ended by request.
+        Cancelled = "cancelled",
+    }
+    else |text| -> String {
+        let known = Self::ALL.map(Self::name).join(", ");
+        format!("there is no state \"{}\"; there are: {known}", text.escape_default())
+    }
 }
 
 /// An event that changes a job's state.
@@ -39,15 +45,6 @@ pub enum JobTransition {
 }
 
 impl JobState {
-    /// Every state.
-    pub const ALL: [Self; 5] = [
-        Self::Queued,
-        Self::Running,
-        Self::Succeeded,
-        Self::Failed,
-        Self::Cancelled,
-    ];
-
     /// The state after the event, or `None` if the event is not legal in this state.
     #[must_use]
     pub fn after(self, event: JobTransition) -> Option<Self> {
@@ -67,18 +64,6 @@ impl JobState {
     #[must_use]
     pub fn is_final(self) -> bool {
         matches!(self, Self::Succeeded | Self::Failed | Self::Cancelled)
-    }
-
-    /// Its name on the wire and in the store.
-    #[must_use]
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Queued => "queued",
-            Self::Running => "running",
-            Self::Succeeded => "succeeded",
-            Self::Failed => "failed",
-            Self::Cancelled => "cancelled",
-        }
     }
 }
 
@@ -100,23 +85,6 @@ impl JobTransition {
     pub fn allowed_states(self) -> &'static str {
         let [_, states] = self.texts();
         states
-    }
-}
-
-impl FromStr for JobState {
-    type Err = String;
-
-    fn from_str(text: &str) -> Result<Self, String> {
-        Self::ALL.into_iter().find(|state| state.name() == text).ok_or_else(|| {
-            let known = Self::ALL.map(Self::name).join(", ");
-            format!("there is no state \"{}\"; there are: {known}", text.escape_default())
-        })
-    }
-}
-
-impl fmt::Display for JobState {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.pad(self.name())
     }
 }
 

@@ -83,9 +83,12 @@ impl UploadedFile {
         objects.push(&self.key(), &self.name).await
     }
 
-    /// Copies it from a shared object store, unless it is here. Errors: `Io`, `Object`.
+    /// Copies it from a shared object store, unless it is here. A copy of one that was deleted there is deleted here too. Errors: `Io`,
+    /// `Object`.
     pub(super) async fn fetch(&self, objects: &Objects) -> Result<(), StoreError> {
-        if !self.path(objects.data_dir()).is_file() {
+        if !objects.has(&format!("{}/{}", self.key(), self.name)).await? {
+            self.forget_copy(objects);
+        } else if !self.path(objects.data_dir()).is_file() {
             objects.pull(&self.key(), &self.name).await?;
         }
         Ok(())

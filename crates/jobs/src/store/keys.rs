@@ -6,7 +6,7 @@ use std::str::FromStr;
 use serde::Deserialize;
 
 use super::audit::Author;
-use super::database::{read_all, values};
+use super::database::{Tx, read_all, values};
 use super::{Store, StoreError};
 
 /// What a key allows. Each scope includes those before it.
@@ -84,6 +84,22 @@ impl KeyRow {
 impl Store {
     /// Adds a key. Errors: `Query`, also if the id exists.
     pub async fn add_key(&self, key: KeyRow, by: &Author) -> Result<(), StoreError> {
+        self.insert_key(self.database.begin().await?, key, by).await
+    }
+
+    /// Adds a key if none was added before, revoked ones included. Returns whether it did: of several servers that start at once, one
+    /// does. Errors: `Query`.
+    pub async fn add_first_key(&self, key: KeyRow, by: &Author) -> Result<bool, StoreError> {
+        let mut tx = self.database.begin().await?;
+        tx.lock_numbers().await?;
+        let is_first = tx.fetch("SELECT id FROM api_keys LIMIT 1", values![]).await?.is_empty();
+        if is_first {
+            self.insert_key(tx, key, by).await?;
+        }
+        Ok(is_first)
+    }
+
+    async fn insert_key(&self, mut tx: Tx, key: KeyRow, by: &Author) -> Result<(), StoreError> {
         self.mark_keys_created()?;
         let sql = "INSERT INTO api_keys (id, name, hash, created_s, scope, expires_s, requests_per_s) \
              VALUES ($1, $2, $3, $4, $5, $6, $7)";
@@ -98,7 +114,8 @@ impl Store {
             expires_s,
             key.requests_per_s
         ];
-        self.execute_recorded(sql, values, change).await.map(drop)
+        tx.execute(sql, values).await?;
+        change.commit(tx).await
     }
 
     /// All keys, also revoked ones, the oldest first. Errors: `Query`.

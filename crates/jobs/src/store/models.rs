@@ -96,6 +96,15 @@ impl Store {
         rows.iter().map(version_of).collect()
     }
 
+    /// All versions that no job made and that were never published, by name and number: a publication of them runs, or did not
+    /// finish. Errors: `Query`.
+    pub async fn unpublished_versions(&self) -> Result<Vec<(ModelName, u32)>, StoreError> {
+        let sql = "SELECT model, version FROM model_versions \
+             WHERE published_s IS NULL AND job IS NULL ORDER BY model, version";
+        let rows = self.database.fetch(sql, values![]).await?;
+        rows.iter().map(version_of).collect()
+    }
+
     /// All versions that were deleted, by name and number. Errors: `Query`.
     pub async fn deleted_versions(&self) -> Result<Vec<(ModelName, u32)>, StoreError> {
         let sql = "SELECT model, version FROM model_versions WHERE deleted_s IS NOT NULL ORDER BY model, version";

@@ -13,6 +13,8 @@ impl Versions {
     /// version, a running server of the same store serves it within seconds. Errors: `Registry`, `Store`.
     pub async fn publish(&self, model: &ModelName, trained_dir: &Path, activates: bool) -> Result<u32, VersionError> {
         registry::load(trained_dir)?;
+        self.sweep_unpublished().await?;
+        let _publishing = self.begin_publication()?;
         let shipped = self.shipped(model).unwrap_or(0);
         let version = self.store.reserve_next_version(model, shipped).await?;
         if let Err(error) = self.write_files(model, version, trained_dir).await {

@@ -23,9 +23,9 @@ const DISK_SIZE: &str = "4g";
 const LEFT_BYTES: u64 = 256 << 10;
 /// The filler takes again what others freed.
 const FILL_PERIOD: Duration = Duration::from_millis(100);
-/// How often readiness is asked for.
+/// How often the metrics are asked for.
 const POLL: Duration = Duration::from_millis(250);
-/// How long the server may take to be ready after an outage.
+/// How long the server may take to write its store after an outage.
 const RECOVERY_LIMIT: Duration = Duration::from_mins(2);
 /// How long the database's lock is waited for.
 const LOCK_LIMIT: Duration = Duration::from_secs(30);
@@ -171,7 +171,8 @@ pub(super) enum Outage {
     Database(DatabaseOutage),
 }
 
-/// When readiness changed, counted from the start and from the end of an outage; `None`: it did not.
+/// When the metric changed that says whether the store can be written, counted from the start and from the end of an outage; `None`: it
+/// did not.
 pub(super) struct OutageReport {
     pub(super) name: &'static str,
     pub(super) noticed: Option<Duration>,
@@ -186,10 +187,10 @@ impl Outage {
         }
     }
 
-    /// Takes it away for a while, and watches the server's readiness until it is ready again.
+    /// Takes it away for a while, and watches the server's metrics until the store can be written again.
     pub(super) async fn hold(&self, run: &Arc<EnduranceRun>, time: Duration) -> OutageReport {
         let (began, end) = (Instant::now(), watch::Sender::new(None::<Instant>));
-        let watching = tokio::spawn(watch_readiness(Arc::clone(run), began, end.subscribe()));
+        let watching = tokio::spawn(watch_store(Arc::clone(run), began, end.subscribe()));
         match self {
             Self::Disk(disk) => disk.fill(time).await,
             Self::Database(database) => database.hold(time).await,
@@ -204,21 +205,21 @@ impl Outage {
     }
 }
 
-async fn watch_readiness(
+async fn watch_store(
     run: Arc<EnduranceRun>,
     began: Instant,
     end: watch::Receiver<Option<Instant>>,
 ) -> (Option<Duration>, Option<Duration>) {
     let (mut http, mut noticed) = (Http::new(run.address), None);
     loop {
-        let answer = http.ask(&Request::get("/readyz")).await;
-        let is_ready = answer.is_ok_and(|answer| answer.status == 200);
-        if !is_ready {
+        let answer = http.ask(&Request::get("/metrics")).await;
+        let is_writable = answer.is_ok_and(|answer| answer.text().contains("\nforeframe_store_writable 1\n"));
+        if !is_writable {
             noticed.get_or_insert_with(|| began.elapsed());
         }
         let ended = *end.borrow();
         if let Some(ended) = ended {
-            if is_ready {
+            if is_writable {
                 return (noticed, Some(ended.elapsed()));
             }
             if ended.elapsed() > RECOVERY_LIMIT {

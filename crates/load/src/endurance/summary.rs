@@ -83,7 +83,7 @@ pub(super) fn print(
     );
     for outage in &incidents.outages {
         println!(
-            "  {} for {} s: not ready after {}, ready {} after its end",
+            "  {} for {} s: noticed after {}, store written again {} after its end",
             outage.name,
             args.outage_s,
             seconds(outage.noticed),
@@ -129,7 +129,7 @@ pub(super) fn check(
     for outage in &incidents.outages {
         bounds.check(
             outage.noticed.is_some() && outage.recovered.is_some(),
-            format!("/readyz told of the {}, and was ready again after it", outage.name),
+            format!("the metrics told of the {}, and of its end", outage.name),
         );
     }
     bounds.check(!incidents.has_crashed, "the server ended only when it was killed");

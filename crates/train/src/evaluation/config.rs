@@ -78,6 +78,10 @@ pub(super) fn test_rooms(dataset: &Dataset) -> Option<RoomSet> {
 /// most data sets. Each takes up to 256 bytes of memory for each input frame; where all are searched, they share their frames.
 pub const NEAREST_WINDOWS: usize = 200_000;
 
+/// Fewer resamples give no 95 % interval.
+#[doc(hidden)]
+pub const MIN_RESAMPLES: usize = 100;
+
 /// What to test on, and how closely.
 #[derive(Clone)]
 pub struct EvaluateConfig<'a> {
@@ -137,7 +141,11 @@ impl EvaluateConfig<'_> {
             ("the stride of windows", self.stride, 1),
             ("the number of windows", self.max_windows, 1),
             ("the number of training windows to search", self.nearest_windows, 1),
-            ("the number of bootstrap samples", self.bootstrap_samples, 100),
+            (
+                "the number of bootstrap resamples",
+                self.bootstrap_samples,
+                MIN_RESAMPLES,
+            ),
             ("the batch size", self.batch, 1),
         ] {
             if value < least {

@@ -25,7 +25,7 @@ impl EvaluationReport {
         environment.add_filter("grouped", grouped);
         environment.add_filter("set_title", set_title);
         environment.add_filter("method", |method: ViaDeserialize<Method>| method.label());
-        environment.add_filter("pixel_class", |class: ViaDeserialize<PixelClass>| class.label());
+        environment.add_filter("pixel_class", |class: ViaDeserialize<PixelClass>| class.name());
         environment.add_filter("variant", |variant: ViaDeserialize<Variant>| variant.label());
         let verdicts = self.sets.iter().map(|set| self.verdict(set));
         let second = |set: &SetReport| set.outcome.scores()?.verdict_against_unfitted();

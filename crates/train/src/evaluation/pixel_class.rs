@@ -5,46 +5,28 @@ use serde::{Deserialize, Serialize};
 
 use super::method::Method;
 use super::replay::ReplayedView;
+use foreframe_core::named_enum;
 
 /// A point is hidden if what the frame shows there is nearer than the point by more than this share of the point's depth.
 const DEPTH_TOLERANCE: f32 = 0.03;
 /// A point's place in a frame is inside it from this depth on, in metres.
 const NEAREST_M: f32 = 0.01;
 
-/// What a pixel of a future frame shows.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum PixelClass {
-    /// Something that the last frame of the context shows too.
-    LastFrame,
-    /// Something that only an earlier frame of the context shows.
-    EarlierFrame,
-    /// Something that no frame of the context shows.
-    NeverSeen,
-    /// A robot.
-    Robot,
-}
-
-impl PixelClass {
-    /// The class in words.
-    #[must_use]
-    pub fn label(self) -> &'static str {
-        match self {
-            Self::LastFrame => "the last frame shows it",
-            Self::EarlierFrame => "only an earlier frame shows it",
-            Self::NeverSeen => "never seen",
-            Self::Robot => "robots",
-        }
+named_enum! {
+    /// What a pixel of a future frame shows, in the order of the tables.
+    #[derive(Serialize, Deserialize)]
+    #[serde(rename_all = "kebab-case")]
+    pub enum PixelClass {
+        /// Something that the last frame of the context shows too.
+        LastFrame = "the last frame shows it",
+        /// Something that only an earlier frame of the context shows.
+        EarlierFrame = "only an earlier frame shows it",
+        /// Something that no frame of the context shows.
+        NeverSeen = "never seen",
+        /// A robot.
+        Robot = "robots",
     }
 }
-
-/// The classes in the order of the tables.
-pub(super) const CLASSES: [PixelClass; 4] = [
-    PixelClass::LastFrame,
-    PixelClass::EarlierFrame,
-    PixelClass::NeverSeen,
-    PixelClass::Robot,
-];
 
 /// Errors by what a pixel shows, over all steps.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -71,15 +53,15 @@ pub struct VisibilityErrors {
 /// Pixels and sums of squared errors of a window, class by class.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub(super) struct ClassSums {
-    pub(super) pixels: [u64; CLASSES.len()],
+    pub(super) pixels: [u64; PixelClass::ALL.len()],
     /// For each row of the tables.
-    pub(super) errors: Vec<[f64; CLASSES.len()]>,
+    pub(super) errors: Vec<[f64; PixelClass::ALL.len()]>,
 }
 
 /// The scores of all windows; `None` if the simulator could not replay one of them.
 pub(super) fn scores(methods: &[Method], windows: Vec<Option<ClassSums>>) -> Option<VisibilityScores> {
     let windows = windows.into_iter().collect::<Option<Vec<_>>>()?;
-    let pixels = CLASSES.map(|class| windows.iter().map(|window| window.pixels[class as usize]).sum::<u64>());
+    let pixels = PixelClass::ALL.map(|class| windows.iter().map(|window| window.pixels[class as usize]).sum::<u64>());
     let all = pixels.iter().sum::<u64>() as f64;
     let mse = |row: usize, class: PixelClass| {
         let sum: f64 = windows.iter().map(|window| window.errors[row][class as usize]).sum();
@@ -88,11 +70,11 @@ pub(super) fn scores(methods: &[Method], windows: Vec<Option<ClassSums>>) -> Opt
     };
     let rows = methods.iter().enumerate().map(|(row, &method)| VisibilityErrors {
         method,
-        mse: CLASSES.iter().map(|&class| mse(row, class)).collect(),
+        mse: PixelClass::ALL.iter().map(|&class| mse(row, class)).collect(),
     });
     (!windows.is_empty()).then(|| VisibilityScores {
         windows: windows.len(),
-        classes: CLASSES.to_vec(),
+        classes: PixelClass::ALL.to_vec(),
         shares: pixels.iter().map(|&pixels| pixels as f64 / all).collect(),
         methods: rows.collect(),
     })

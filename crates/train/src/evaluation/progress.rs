@@ -9,45 +9,30 @@ use super::EvaluationError;
 use super::config::EvaluateConfig;
 use super::division::Division;
 use super::inference::Inference;
+use foreframe_core::named_enum;
 use foreframe_data::dataset::Window;
 use foreframe_data::dataset::sampler::Split;
 
-/// What is being computed.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum EvaluationStage {
-    /// Model and baselines, frame by frame.
-    Scores,
-    /// The action table.
-    Actions,
-    /// Plan identification.
-    Plans,
-    /// Which plan would be chosen.
-    Ranking,
-    /// Where movers are.
-    Surroundings,
-    /// How far away things are.
-    Depth,
-    /// Errors by what a pixel shows.
-    #[doc(hidden)]
-    Visibility,
-    /// Expected errors and novelty.
-    Calibration,
-}
-
-impl EvaluationStage {
-    /// The stage in a word.
-    #[must_use]
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Scores => "scores",
-            Self::Actions => "actions",
-            Self::Plans => "plans",
-            Self::Ranking => "ranking",
-            Self::Surroundings => "surroundings",
-            Self::Depth => "depth",
-            Self::Visibility => "visibility",
-            Self::Calibration => "calibration",
-        }
+named_enum! {
+    /// What is being computed.
+    pub enum EvaluationStage {
+        /// Model and baselines, frame by frame.
+        Scores = "scores",
+        /// The action table.
+        Actions = "actions",
+        /// Plan identification.
+        Plans = "plans",
+        /// Which plan would be chosen.
+        Ranking = "ranking",
+        /// Where movers are.
+        Surroundings = "surroundings",
+        /// How far away things are.
+        Depth = "depth",
+        /// Errors by what a pixel shows.
+        #[doc(hidden)]
+        Visibility = "visibility",
+        /// Expected errors and novelty.
+        Calibration = "calibration",
     }
 }
 

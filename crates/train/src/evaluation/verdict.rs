@@ -44,6 +44,8 @@ impl SetScores {
         let percent = 100.0 * mean.abs();
         let contains_0 = interval.is_some_and(|interval| (interval.low..=interval.high).contains(&0.0));
         let verdict = match mean {
+            // One group has no interval.
+            _ if interval.is_none() && percent < 0.5 => format!("about as good as {baseline}; {ADVICE}"),
             _ if contains_0 => {
                 format!("about as good as {baseline}: the interval of the skill contains 0; {ADVICE}")
             }
@@ -178,6 +180,12 @@ mod tests {
         ] {
             assert_eq!(verdict(mean, Some(interval), true), expected);
         }
+        let equal = verdict(0.0, None, false);
+        assert_eq!(
+            equal,
+            "about as good as the strongest baseline (copy last frame); more data or a longer training may help; 0 blocks are too \
+             few to be sure"
+        );
         let unsure = verdict(0.5, None, false);
         assert!(unsure.ends_with("by 50 %; 0 blocks are too few to be sure"), "{unsure}");
     }

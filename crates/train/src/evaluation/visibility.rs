@@ -6,7 +6,7 @@ use super::EvaluationError;
 use super::baselines::{BaselineInput, Baselines};
 use super::inference::{ActionSource, Inference};
 use super::method::Method;
-use super::pixel_class::{CLASSES, ClassSums, PixelClass, classes};
+use super::pixel_class::{ClassSums, PixelClass, classes};
 use super::progress::{EvaluationContext, EvaluationStage, Pass};
 use super::replay::{has_size_of, replayed_views};
 use super::windows::{evenly, true_frame, window_shape};
@@ -62,7 +62,7 @@ fn class_sums(
     let (seen, coming) = views.split_at(shape.context);
     let classes: Vec<Vec<PixelClass>> = coming.iter().map(|view| classes(view, seen)).collect();
     let input = BaselineInput::of_window(dataset, window, shape, inputs);
-    let sums = |&method: &Method| -> Result<[f64; CLASSES.len()], EvaluationError> {
+    let sums = |&method: &Method| -> Result<[f64; PixelClass::ALL.len()], EvaluationError> {
         let own = |frames: &[f32]| -> Vec<Vec<f32>> {
             let frames = frames.chunks_exact(spec.pixels());
             frames.map(|frame| spec.preprocess.inverse(frame)).collect()
@@ -74,7 +74,7 @@ fn class_sums(
             }
             baseline => baselines.predict(dataset, baseline, &input, shape.horizon)?,
         };
-        let mut sums = [0.0; CLASSES.len()];
+        let mut sums = [0.0; PixelClass::ALL.len()];
         let steps = frames.iter().zip(truth).zip(&classes);
         for ((frame, truth), classes) in steps {
             for ((value, truth), &class) in frame.iter().zip(truth).zip(classes) {
@@ -83,7 +83,7 @@ fn class_sums(
         }
         Ok(sums)
     };
-    let mut pixels = [0; CLASSES.len()];
+    let mut pixels = [0; PixelClass::ALL.len()];
     for &class in classes.iter().flatten() {
         pixels[class as usize] += 1;
     }

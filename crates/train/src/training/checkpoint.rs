@@ -18,6 +18,7 @@ use foreframe_core::files::{
     is_partial_of, none_if_missing, remove_stale_partials, sha256_hex, try_lock, write_atomically,
 };
 use foreframe_core::nn::{ModelSpec, Parameters};
+use foreframe_data::dataset::Dataset;
 
 /// Name of the checkpoint file of a run.
 pub const CHECKPOINT_FILE: &str = "checkpoint.safetensors";
@@ -34,7 +35,7 @@ const CONFIG_FILE: &str = "config.toml";
 pub(super) const HISTORY_FILE: &str = "history.json";
 /// Name of the folder with the published model.
 pub(super) const MODEL_DIR: &str = "model";
-/// Name of the file with the hash of the training data.
+/// Name of the file with the hash of the training data and, after it, its description.
 const DATA_FILE: &str = "dataset.sha256";
 const PARAMETERS: &str = "parameters.";
 const BEST: &str = "best.";
@@ -45,28 +46,39 @@ pub(super) struct RunFiles {
     run_dir: PathBuf,
     config_text: String,
     content_hash: String,
+    /// What the hash of the content leaves out: camera, channels, frame size and period.
+    description: String,
 }
 
 impl RunFiles {
     /// Checks that the directory is unused, or contains a run with the same configuration and data. Writes nothing.
     /// Errors: `NotARun`, `OtherRun`, `Io`.
-    pub(super) fn check(run_dir: &Path, config: &TrainConfig, content_hash: &str) -> Result<Self, TrainError> {
+    pub(super) fn check(run_dir: &Path, config: &TrainConfig, dataset: &Dataset) -> Result<Self, TrainError> {
         let files = Self {
             run_dir: run_dir.to_owned(),
             config_text: config.to_toml()?,
-            content_hash: content_hash.to_owned(),
+            content_hash: dataset.info().content_hash.clone(),
+            description: dataset.description(),
         };
         let (config, data) = (files.path(CONFIG_FILE), files.path(DATA_FILE));
         if config.is_file() && data.is_file() {
-            for (path, expected, what) in [
-                (&config, &files.config_text, "configuration"),
-                (&data, &files.content_hash, "data set"),
-            ] {
-                let found = fs::read_to_string(path).map_err(io_failed("read", path))?;
-                if found != *expected {
-                    let run_dir = run_dir.to_owned();
-                    return Err(TrainError::OtherRun { run_dir, what });
-                }
+            let read = |path: &Path| fs::read_to_string(path).map_err(io_failed("read", path));
+            let (found, run_dir) = (read(&data)?, run_dir.to_owned());
+            if read(&config)? != files.config_text {
+                let what = "configuration";
+                return Err(TrainError::OtherRun { run_dir, what });
+            }
+            let (content, description) = found.split_once('\n').unwrap_or((&found, ""));
+            if content != files.content_hash {
+                let what = "data set";
+                return Err(TrainError::OtherRun { run_dir, what });
+            }
+            // A run of an earlier program has no description.
+            if !description.is_empty() && description != files.description {
+                return Err(TrainError::OtherDescription {
+                    run_dir,
+                    dataset: dataset.info().name.clone(),
+                });
             }
             return Ok(files);
         }
@@ -86,7 +98,8 @@ impl RunFiles {
         let (config, data) = (self.path(CONFIG_FILE), self.path(DATA_FILE));
         if !config.is_file() {
             fs::create_dir_all(&self.run_dir).map_err(io_failed("create", &self.run_dir))?;
-            write_atomically(&data, self.content_hash.as_bytes()).map_err(io_failed("write", &data))?;
+            let text = format!("{}\n{}", self.content_hash, self.description);
+            write_atomically(&data, text.as_bytes()).map_err(io_failed("write", &data))?;
             write_atomically(&config, self.config_text.as_bytes()).map_err(io_failed("write", &config))?;
         }
         let lock = File::open(&config).map_err(io_failed("read", &config))?;
@@ -102,6 +115,11 @@ impl RunFiles {
 
     /// Identifies configuration and data. A checkpoint can be resumed only with the same fingerprint.
     fn fingerprint(&self) -> String {
+        sha256_hex(format!("{}\n{}\n{}", self.config_text, self.content_hash, self.description).as_bytes())
+    }
+
+    /// The same without the description, as an earlier program wrote it.
+    fn earlier_fingerprint(&self) -> String {
         sha256_hex(format!("{}\n{}", self.config_text, self.content_hash).as_bytes())
     }
 
@@ -260,7 +278,7 @@ impl RunFiles {
             .and_then(|metadata| state_text(metadata.get(META_KEY)?))
             .ok_or("it contains no training state")?;
         let meta: CheckpointMeta = serde_json::from_str(text).map_err(|error| error.to_string())?;
-        if meta.fingerprint != self.fingerprint() {
+        if ![self.fingerprint(), self.earlier_fingerprint()].contains(&meta.fingerprint) {
             return Err("it belongs to another run".to_owned());
         }
         let tensors = candle_core::safetensors::load_buffer(bytes, &Device::Cpu).map_err(|error| error.to_string())?;

@@ -12,6 +12,7 @@ use super::observer::TrainingStage;
 use super::optimizer::{OptimizerConfig, UpdateRule};
 use foreframe_core::frame::warp::CameraModel;
 use foreframe_core::nn::loss::Loss;
+use foreframe_core::nn::spec::MIN_CHANNEL_STD;
 use foreframe_core::nn::{Architecture, ChannelScale, FlowSpec, ModelSpec};
 use foreframe_core::types::{Channel, ModelName, Seed};
 use foreframe_data::dataset::{Dataset, DatasetInfo, Lacking, sampler::WindowShape};
@@ -375,7 +376,7 @@ fn scales<'a>(channels: &[Channel], frames: &[usize], values: impl Fn(usize) -> 
     let scale = |(index, channel): (usize, &Channel)| {
         let known = known(index);
         let mean = moment(&known, 1, 0.0);
-        let std = (moment(&known, 2, mean).sqrt() as f32).max(1e-3);
+        let std = (moment(&known, 2, mean).sqrt() as f32).max(MIN_CHANNEL_STD);
         scaled(channel, mean as f32, std)
     };
     channels.iter().enumerate().map(scale).collect()

@@ -45,6 +45,33 @@ pub enum TrainError {
         /// `configuration` or `data set`.
         what: &'static str,
     },
+    /// The directory holds a run on the same frames and numbers, which were described otherwise.
+    #[error(
+        "{} holds a run on the data set {dataset:?} as it was before: its camera, channels, units, frame size or frame period has \
+         changed; use a new directory, or import the data set as it was to resume the run",
+        run_dir.display()
+    )]
+    OtherDescription {
+        /// The run's directory.
+        run_dir: PathBuf,
+        /// The data set.
+        dataset: String,
+    },
+    /// The model of a finished run is damaged.
+    #[error(
+        "the training in {} is complete, but its model is damaged: {source}; delete {}, and the same command makes the model again \
+         from the run's checkpoint",
+        run_dir.display(),
+        model_dir.display()
+    )]
+    DamagedModel {
+        /// The run's directory.
+        run_dir: PathBuf,
+        /// The model's directory.
+        model_dir: PathBuf,
+        /// What is wrong with it.
+        source: RegistryError,
+    },
     /// The training split or the validation split has no window.
     #[error(
         "the data set \"{dataset}\" has {train} training windows and {validation} validation windows of {frames} frames; training needs \
@@ -164,8 +191,10 @@ impl HasErrorKind for TrainError {
             | Self::ConstantActions { .. }
             | Self::OtherUnits { .. }
             | Self::NoWindows { .. } => ErrorKind::Usage,
-            Self::NotARun(_) | Self::OtherRun { .. } => ErrorKind::Conflict,
-            Self::OtherNetwork { .. } | Self::Checkpoint { .. } | Self::Frame(_) => ErrorKind::Unusable,
+            Self::NotARun(_) | Self::OtherRun { .. } | Self::OtherDescription { .. } => ErrorKind::Conflict,
+            Self::OtherNetwork { .. } | Self::Checkpoint { .. } | Self::DamagedModel { .. } | Self::Frame(_) => {
+                ErrorKind::Unusable
+            }
             Self::Busy(_) => ErrorKind::Busy,
             Self::Diverged { .. } | Self::Io { .. } | Self::Optimizer(_) => ErrorKind::Internal,
         }

@@ -9,8 +9,8 @@ use super::observer::{Observer, TrainingEvent, TrainingStage};
 use foreframe_core::files::write_atomically;
 use foreframe_core::frame::{Frame, codec};
 
-/// How many points of a stage's training loss are written, besides those of its validations.
-const CURVE_POINTS: usize = 500;
+/// How many points of a stage's training loss are kept, besides those of its validations.
+pub const CURVE_POINTS: usize = 500;
 /// Name of the picture in a run's directory: a validation window's true frames above the frames predicted at the latest validation of
 /// the second stage.
 pub const SAMPLE_FILE: &str = "sample.png";

@@ -1,24 +1,18 @@
 //! Events of a training, for progress displays and reports.
 
+use foreframe_core::named_enum;
 use serde::{Deserialize, Serialize};
 
-/// The two stages of a training.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
-#[serde(rename_all = "lowercase")]
-pub enum TrainingStage {
-    /// Stage 1, pre-training: the dense codec alone.
-    Pretrain,
-    /// Stage 2, sequence training: the recurrent network.
-    Sequence,
-}
-
-impl std::fmt::Display for TrainingStage {
-    fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        formatter.write_str(match self {
-            Self::Pretrain => "pretrain",
-            Self::Sequence => "sequence",
-        })
+named_enum! {
+    /// The two stages of a training.
+    #[derive(PartialOrd, Ord, Serialize, Deserialize)]
+    #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
+    #[serde(rename_all = "lowercase")]
+    pub enum TrainingStage {
+        /// Stage 1, pre-training: the dense codec alone.
+        Pretrain = "pretrain",
+        /// Stage 2, sequence training: the recurrent network.
+        Sequence = "sequence",
     }
 }
 

@@ -7,7 +7,6 @@ use super::state::TrainState;
 use super::{START_KEY, TrainError, Training};
 use crate::frame_marks;
 use foreframe_core::nn::ModelSpec;
-use foreframe_core::nn::spec::MIN_CHANNEL_STD;
 use foreframe_core::registry::{DatasetShare, DatasetStamp, Manifest, ProgramStamp};
 use foreframe_data::dataset::sampler::{Split, Splits, first_seconds};
 use foreframe_data::dataset::{Dataset, DatasetInfo, DatasetPart, Window};
@@ -76,7 +75,7 @@ impl<'a> TrainingPlan<'a> {
         let frames = window_frames(&train, shape.context + shape.horizon);
         let spec = config.model_spec(dataset, &frames);
         check_conditioning(&dataset.info().name, &spec)?;
-        check_actions(config, dataset, &spec)?;
+        check_actions(config, dataset, &spec, &frames)?;
         check_movers(config, dataset, &spec)?;
         spec.validate()?;
         let augmentation = Augmentation::new(&config.data, dataset, &frames, config.seed)?;
@@ -212,10 +211,21 @@ pub(super) fn check_conditioning(dataset: &str, spec: &ModelSpec) -> Result<(), 
     )))
 }
 
-/// Errors: `ConstantActions` if the model takes actions that never change, so that it could not learn what they do.
-fn check_actions(config: &TrainConfig, dataset: &Dataset, spec: &ModelSpec) -> Result<(), TrainError> {
-    let never_change =
-        spec.action_inputs().is_some() && spec.actions.iter().all(|action| action.std <= MIN_CHANNEL_STD);
+/// Errors: `ConstantActions` if the model takes actions that are the same in all frames, so that it could not learn what they do.
+fn check_actions(
+    config: &TrainConfig,
+    dataset: &Dataset,
+    spec: &ModelSpec,
+    frames: &[usize],
+) -> Result<(), TrainError> {
+    let changes = |component: usize| {
+        // Of joined data sets, one may lack a channel.
+        let values = frames.iter().map(|&frame| dataset.action(frame)[component]);
+        let mut known = values.filter(|value| value.is_finite());
+        let first = known.next();
+        known.any(|value| Some(value) != first)
+    };
+    let never_change = spec.action_inputs().is_some() && !(0..spec.actions.len()).any(changes);
     if !never_change || config.data.constant_actions {
         return Ok(());
     }

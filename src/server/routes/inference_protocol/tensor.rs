@@ -131,9 +131,16 @@ impl Tensor {
         };
         let wrong = |found: usize| refused(format!("holds {found} values; its shape {:?} has {count}", head.shape));
         let (values, rest) = match (head.data, head.parameters.binary_data_size) {
-            (Some(NestedNumbers { values: numbers, .. }), None) => {
+            (Some(NestedNumbers { shape, values: numbers }), None) => {
                 if numbers.len() != count {
                     return Err(wrong(numbers.len()));
+                }
+                // A flat list is in row-major order.
+                if shape.len() > 1 && shape != head.shape {
+                    return Err(refused(format!(
+                        "has lists of the shape {shape:?}; its shape is {:?}",
+                        head.shape
+                    )));
                 }
                 (from_numbers(datatype, numbers).map_err(refused)?, binary)
             }

@@ -42,6 +42,7 @@ pub(super) struct PlanRequest {
     #[serde(default)]
     search: PlanSearch,
     /// The plan that the robot follows now; it is always one of the plans tried, and the search begins there. Its last action is held.
+    #[schema(max_items = 256)]
     #[serde(default)]
     present: Vec<Vec<f32>>,
     /// The action before the plan, from which `max_change` is counted first.

@@ -103,6 +103,7 @@ struct ActionExtra {
     /// The future actions, the first from this observation on. Without them, the action is repeated.
     plan: Option<Vec<Vec<f32>>>,
     /// How many observations to predict. Default: the model's horizon.
+    #[schema(minimum = 1, maximum = 256)]
     steps: Option<usize>,
 }
 
@@ -142,7 +143,7 @@ impl WorldStepRequest {
         Ok(FrameStep {
             seq: self.step_id,
             timestamp_us: 0,
-            conditioning: conditions.check(&STEP_FIELDS, manifest, max_steps)?,
+            conditions: conditions.check(&STEP_FIELDS, manifest, max_steps)?,
             frame: images::resized(&field, frame, observation.extra.resize, manifest)?,
             format: ImageFormat::Raw,
             is_overtaken: false,

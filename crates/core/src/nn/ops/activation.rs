@@ -3,10 +3,7 @@
 // `pulp` compiles a closure with vector instructions; that includes only functions that are inlined into it.
 #![allow(clippy::inline_always)]
 
-use crate::vectorized::Instructions;
-
-/// 1.5 · 2^23: after adding it, the low bits hold the nearest whole number.
-pub(super) const ROUND: f32 = 12_582_912.0;
+use crate::vectorized::{Instructions, ROUND};
 
 /// tanh(x) = 2σ(2x) − 1.
 #[inline(always)]

@@ -4,8 +4,7 @@
 
 use std::f32::consts::{FRAC_2_PI, FRAC_PI_4};
 
-use super::activation::ROUND;
-use crate::vectorized::Instructions;
+use crate::vectorized::{Instructions, ROUND};
 
 /// Sine and cosine of x. Up to ±1000 they differ from the exact values by less than 2e-7; those of larger arguments
 /// are inaccurate, but within −1 to 1. Those of NaN and infinities are NaN.

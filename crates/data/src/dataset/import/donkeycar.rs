@@ -9,7 +9,8 @@ use serde_json::{Map, Value};
 
 use super::files::{folder_name, inside, open_file, read_text};
 use super::image_files::ImageFiles;
-use super::recording::{Record, Recording};
+use super::options::are_none;
+use super::recording::{Record, Recording, any_follow};
 use super::skipped::{SkippedList, listed, shortened};
 use super::{ImportError, ImportOptions};
 
@@ -79,8 +80,11 @@ impl TubManifest {
         first.ok_or_else(|| self.missing("an image input", "--image"))
     }
 
-    /// The named inputs, which must exist.
+    /// The named inputs, which must exist; none for `none`.
     fn named(&self, names: &[String], option: &str) -> Result<Vec<String>, ImportError> {
+        if are_none(names) {
+            return Ok(Vec::new());
+        }
         let is_known = |name: &String| self.inputs.iter().any(|(input, _)| input == name);
         match names.iter().find(|name| !is_known(name)) {
             Some(name) => Err(self.missing(&format!("input \"{name}\""), option)),
@@ -140,7 +144,7 @@ pub(super) fn open(tub: &Path, options: &ImportOptions) -> Result<Recording, Imp
             }
         }
     }
-    let notes = note_on_deleted(tub, marked, records.len())?;
+    let notes = note_on_deleted(tub, marked, &records)?;
     // `user/angle` becomes `angle`.
     let channel = |name: &String| options.channel(name.rsplit('/').next().unwrap_or(name), "");
     Ok(Recording {
@@ -152,14 +156,14 @@ pub(super) fn open(tub: &Path, options: &ImportOptions) -> Result<Recording, Imp
     })
 }
 
-/// What is said about records that are marked as deleted. Errors: `Option` if the others are too few.
-fn note_on_deleted(tub: &Path, marked: usize, kept: usize) -> Result<Vec<String>, ImportError> {
-    match (marked, kept) {
-        (0, _) => Ok(Vec::new()),
-        (_, 0 | 1) => Err(ImportError::Option(format!(
+/// What is said about records that are marked as deleted. Errors: `Option` if no two of the others follow each other.
+fn note_on_deleted(tub: &Path, marked: usize, kept: &[Record]) -> Result<Vec<String>, ImportError> {
+    match marked {
+        0 => Ok(Vec::new()),
+        _ if !any_follow(kept) => Err(ImportError::Option(format!(
             "{marked} of the {} records of {} are marked as deleted in {MANIFEST}, so that no two consecutive frames are left; \
              --include-deleted imports them, too",
-            marked + kept,
+            marked + kept.len(),
             tub.display()
         ))),
         _ => Ok(vec![format!(

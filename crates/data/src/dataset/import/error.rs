@@ -84,6 +84,20 @@ pub enum ImportError {
     /// Nothing is left to import.
     #[error("{} holds no two consecutive frames; a data set needs more", .0.display())]
     Empty(PathBuf),
+    /// What is left to import are single frames.
+    #[error(
+        "{} holds no two consecutive frames, since something was left out {left_out} times; a data set needs frames that follow \
+         each other. The first that was left out: {first}",
+        path.display()
+    )]
+    Scattered {
+        /// The recording.
+        path: PathBuf,
+        /// How many items or runs of items were left out.
+        left_out: u64,
+        /// The first of them, and why.
+        first: String,
+    },
     /// Another import uses the directory with other options, or it holds something else.
     #[error("{} exists and belongs to something else ({what}); name a new directory", path.display())]
     OutExists {
@@ -170,6 +184,11 @@ impl ImportError {
             Self::Option(reason) => Self::Option(text(reason)),
             Self::Program(reason) => Self::Program(text(reason)),
             Self::Empty(path) => Self::Empty(moved(path)),
+            Self::Scattered { path, left_out, first } => Self::Scattered {
+                path: moved(path),
+                left_out,
+                first: text(first),
+            },
             Self::Io { action, path, source } => Self::Io {
                 action,
                 path: moved(path),

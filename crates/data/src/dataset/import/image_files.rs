@@ -13,6 +13,10 @@ use foreframe_core::frame::{Frame, codec};
 pub(super) struct ImageFiles(pub(super) Vec<PathBuf>);
 
 impl ImageSource for ImageFiles {
+    fn file(&self, wanted: &Record) -> Option<&Path> {
+        Some(&self.0[wanted.image])
+    }
+
     fn read(&self, wanted: &Record, _cancelled: &AtomicBool) -> Result<Frame, ImportError> {
         let Record { image, place, .. } = wanted;
         let path = &self.0[*image];

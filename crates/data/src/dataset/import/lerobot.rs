@@ -11,7 +11,7 @@ use std::sync::atomic::AtomicBool;
 
 use indexmap::IndexMap;
 
-use self::description::{Component, Description, INFO};
+use self::description::{ACTION, Component, Description, INFO, STATE};
 use self::episodes::{EpisodeEntry, VideoPart};
 use self::images::ImageTable;
 use self::rows::{Row, read_rows};
@@ -30,8 +30,8 @@ pub(super) fn is_lerobot(source: &Path) -> bool {
 pub(super) fn open(source: &Path, options: &ImportOptions, cancelled: &AtomicBool) -> Result<Recording, ImportError> {
     let description = Description::read(source)?;
     let image = description.image(options)?;
-    let actions = description.components(&options.actions, "action", "--action")?;
-    let states = description.components(&options.states, "observation.state", "--state")?;
+    let actions = description.components(&options.actions, ACTION, "--action")?;
+    let states = description.components(&options.states, STATE, "--state")?;
     let columns: Vec<_> = actions.iter().chain(&states).cloned().collect();
     let episodes = description.episodes(&image)?;
     let mut reader = EpisodeReader {
@@ -70,6 +70,7 @@ pub(super) fn open(source: &Path, options: &ImportOptions, cancelled: &AtomicBoo
         action_channels: actions.iter().map(channel).collect(),
         state_channels: states.iter().map(channel).collect(),
         skipped: reader.skipped,
+        notes: description.notes(options),
         ..recording
     })
 }

@@ -10,7 +10,8 @@ use zip::read::ZipFile;
 use zip::{CompressionMethod, ZipArchive};
 
 use super::files::{open_file, stem};
-use super::numpy::ArrayHeader;
+use super::numpy::{ArrayHeader, holds_texts};
+use super::options::are_none;
 use super::raw_images::{FrameLayout, FramePosition, RawImages};
 use super::recording::{Record, Recording, seconds_per_unit};
 use super::skipped::listed;
@@ -78,6 +79,7 @@ pub(super) fn open(path: &Path, config: &ImportConfig, cancelled: &AtomicBool) -
     Ok(Recording {
         action_channels: channels(&actions),
         state_channels: channels(&states),
+        notes: npz.notes,
         ..Recording::new(stem(path, "array"), records, images)
     })
 }
@@ -111,6 +113,8 @@ struct Npz {
     archive: ZipArchive<File>,
     /// Names of the arrays, without `.npy`.
     names: Vec<String>,
+    /// What was left out of the actions and states, in sentences for the user.
+    notes: Vec<String>,
 }
 
 impl Npz {
@@ -124,6 +128,7 @@ impl Npz {
         Ok(Self {
             path: path.to_owned(),
             names: names.collect(),
+            notes: Vec::new(),
             archive,
         })
     }
@@ -160,7 +165,7 @@ impl Npz {
         }
     }
 
-    /// The arrays named, or the one of the usual names.
+    /// The arrays named, or the one of the usual names, if it holds no texts.
     fn chosen(
         &mut self,
         given: &[String],
@@ -168,12 +173,23 @@ impl Npz {
         option: &str,
         layout: &FrameLayout,
     ) -> Result<Vec<ArrayRows>, ImportError> {
+        if are_none(given) {
+            return Ok(Vec::new());
+        }
         let mut names = Vec::new();
         for name in given {
             names.extend(self.find(Some(name), &[], option)?);
         }
-        if given.is_empty() {
-            names.extend(self.find(None, usual, option)?);
+        if given.is_empty()
+            && let Some(name) = self.find(None, usual, option)?
+        {
+            let place = self.place(&name);
+            if holds_texts(self.entry(&name)?, &place)? {
+                let note = format!("the array \"{name}\" holds texts, no numbers, so it was not imported");
+                self.notes.push(note);
+            } else {
+                names.push(name);
+            }
         }
         names.iter().map(|name| self.rows(name, layout)).collect()
     }
@@ -248,6 +264,10 @@ impl Npz {
         }
         let values = header.number.values(&content);
         match values.iter().position(|value| !(*value as f32).is_finite()) {
+            Some(at) if values[at].is_finite() => Err(wrong(format!(
+                "value {at} is {:e}; it is too large for a number of 32 bits, which is at most 3.4e38",
+                values[at]
+            ))),
             Some(at) => Err(wrong(format!(
                 "value {at} is {}; it must be a finite number",
                 values[at]

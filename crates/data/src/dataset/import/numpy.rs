@@ -64,31 +64,10 @@ impl ArrayHeader {
     }
 
     /// Reads the `.npy` header, format versions 1 to 3. Errors: `Record`.
-    pub(super) fn read(mut reader: impl Read, place: &str) -> Result<Self, ImportError> {
+    pub(super) fn read(reader: impl Read, place: &str) -> Result<Self, ImportError> {
         let wrong = |reason: &str| ImportError::record(place, reason);
-        let mut read = |bytes: &mut [u8]| {
-            let read = reader.read_exact(bytes);
-            read.map_err(|_| wrong("the file ends within its header"))
-        };
-        let mut start = [0; 8];
-        read(&mut start)?;
-        if !start.starts_with(MAGIC) {
-            return Err(wrong("this is not a NumPy array; save one with numpy.save"));
-        }
-        let mut length = [0; 4];
-        let length_bytes = if start[6] == 1 { 2 } else { 4 };
-        read(&mut length[..length_bytes])?;
-        let length = u32::from_le_bytes(length) as usize;
-        if length > MAX_HEADER_BYTES {
-            return Err(wrong(&format!(
-                "its header has {length} bytes; at most {MAX_HEADER_BYTES} are read"
-            )));
-        }
-        let mut text = vec![0; length];
-        read(&mut text)?;
-        let text = String::from_utf8_lossy(&text);
-        let kind = after(&text, "descr").and_then(|rest| rest.strip_prefix('\'')?.split_once('\''));
-        let (kind, _) = kind.ok_or_else(|| wrong("its header names no type"))?;
+        let (text, data_offset) = header_text(reader, place)?;
+        let kind = kind(&text).ok_or_else(|| wrong("its header names no type"))?;
         let number = match kind {
             "|u1" | "<u1" | ">u1" | "u1" => NumberType::U8,
             "|b1" => NumberType::Bool,
@@ -124,9 +103,48 @@ impl ArrayHeader {
         Ok(Self {
             number,
             shape: shape.ok_or_else(|| wrong("its header has no shape"))?,
-            data_offset: (8 + length_bytes + length) as u64,
+            data_offset,
         })
     }
+}
+
+/// The dictionary of a `.npy` header, and where the values begin. Errors: `Record`.
+fn header_text(mut reader: impl Read, place: &str) -> Result<(String, u64), ImportError> {
+    let wrong = |reason: &str| ImportError::record(place, reason);
+    let mut read = |bytes: &mut [u8]| {
+        let read = reader.read_exact(bytes);
+        read.map_err(|_| wrong("the file ends within its header"))
+    };
+    let mut start = [0; 8];
+    read(&mut start)?;
+    if !start.starts_with(MAGIC) {
+        return Err(wrong("this is not a NumPy array; save one with numpy.save"));
+    }
+    let mut length = [0; 4];
+    let length_bytes = if start[6] == 1 { 2 } else { 4 };
+    read(&mut length[..length_bytes])?;
+    let length = u32::from_le_bytes(length) as usize;
+    if length > MAX_HEADER_BYTES {
+        return Err(wrong(&format!(
+            "its header has {length} bytes; at most {MAX_HEADER_BYTES} are read"
+        )));
+    }
+    let mut text = vec![0; length];
+    read(&mut text)?;
+    let text = String::from_utf8_lossy(&text).into_owned();
+    Ok((text, (8 + length_bytes + length) as u64))
+}
+
+/// The type that a header names, as in `<f4`.
+fn kind(text: &str) -> Option<&str> {
+    let (kind, _) = after(text, "descr")?.strip_prefix('\'')?.split_once('\'')?;
+    Some(kind)
+}
+
+/// Whether the values of an array are texts. Errors: `Record`.
+pub(super) fn holds_texts(reader: impl Read, place: &str) -> Result<bool, ImportError> {
+    let (text, _) = header_text(reader, place)?;
+    Ok(kind(&text).is_some_and(|kind| kind.contains(['U', 'S'])))
 }
 
 /// The text after `'key':` in a Python dictionary.

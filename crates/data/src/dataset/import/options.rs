@@ -9,6 +9,8 @@ use foreframe_core::frame::resize::Resize;
 use foreframe_core::frame::{FrameSize, MAX_SIDE_PX};
 use foreframe_core::types::Channel;
 
+/// In place of the names of actions or states: there are none.
+const NONE: &str = "none";
 /// The largest [`ImportOptions::every`].
 const MAX_EVERY: usize = 1_000_000;
 
@@ -65,10 +67,10 @@ pub struct ImportOptions {
     // In seconds, unless its name ends with _ms, _us or _ns.
     #[cfg_attr(feature = "cli", arg(long, value_name = "NAME"))]
     pub time: Option<String>,
-    /// A component of the action, or a TOPIC or TOPIC:FIELD,FIELD of a bag; may be given many times [default: found by name or type]
+    /// A component of the action, or a TOPIC or TOPIC:FIELD,FIELD of a bag; may be given many times; `none` leaves all out [default: found by name or type]
     #[cfg_attr(feature = "cli", arg(long = "action", value_name = "NAME"))]
     pub actions: Vec<String>,
-    /// A component of the state, or a topic as for the action; may be given many times [default: found by name or type]
+    /// A component of the state, or a topic as for the action; may be given many times; `none` leaves all out [default: found by name or type]
     #[cfg_attr(feature = "cli", arg(long = "state", value_name = "NAME"))]
     pub states: Vec<String>,
     /// The unit of an action or state, as in speed=m/s; may be given many times
@@ -126,6 +128,11 @@ impl Default for ImportOptions {
     }
 }
 
+/// Whether the names of actions or states say that there are none.
+pub(super) fn are_none(names: &[String]) -> bool {
+    matches!(names, [one] if one == NONE)
+}
+
 /// Width and height in pixels, written as in `64x64`. Errors: what would be right.
 pub fn parse_size(text: &str) -> Result<FrameSize, &'static str> {
     let size = |(width, height): (&str, &str)| {
@@ -146,8 +153,8 @@ impl ImportOptions {
             ("--csv", self.csv.is_some()),
             ("--image", self.image.is_some()),
             ("--time", self.time.is_some()),
-            ("--action", !self.actions.is_empty()),
-            ("--state", !self.states.is_empty()),
+            ("--action", !self.actions.is_empty() && !are_none(&self.actions)),
+            ("--state", !self.states.is_empty() && !are_none(&self.states)),
         ];
         match named.iter().find(|(_, is_given)| *is_given) {
             None => Ok(()),

@@ -1,5 +1,6 @@
 //! The records of a recording before they are brought to one frame rate.
 
+use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use rayon::prelude::*;
@@ -24,6 +25,16 @@ pub(super) struct Record {
     pub(super) image: usize,
     /// File and line, frame or position, for messages.
     pub(super) place: String,
+}
+
+/// Whether two records can be in one episode: nothing between them was left out.
+pub(super) fn is_next(before: &Record, now: &Record) -> bool {
+    before.session == now.session && !now.begins_episode
+}
+
+/// Whether any two records can be in one episode.
+pub(super) fn any_follow(records: &[Record]) -> bool {
+    records.windows(2).any(|pair| is_next(&pair[0], &pair[1]))
 }
 
 /// Everything that a source holds, in the order of time.
@@ -76,6 +87,11 @@ pub(super) trait ImageSource: Send + Sync {
             resize(&self.read(wanted, cancelled)?, &wanted.place)
         };
         wanted.par_iter().map(resized).collect()
+    }
+
+    /// The file of an image that has one of its own.
+    fn file(&self, _wanted: &Record) -> Option<&Path> {
+        None
     }
 
     /// Decodes one image as gray. Errors: as [`Self::read_all`].

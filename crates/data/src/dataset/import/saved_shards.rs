@@ -1,6 +1,7 @@
 //! The shards that the parts of an import saved, each with what was left out of it.
 
 use std::fs;
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
@@ -9,7 +10,7 @@ use sha2::{Digest, Sha256};
 use super::encoder::EncodedShard;
 use super::skipped::SkippedList;
 use super::timing::ImportPlan;
-use super::{ImportConfig, ImportError};
+use super::{ImportConfig, ImportError, ImportOptions};
 use crate::dataset::collect::unfinished;
 use crate::dataset::info::DatasetInfo;
 use crate::dataset::store::files::write_atomically;
@@ -38,7 +39,10 @@ impl<'a> SavedShards<'a> {
     /// Those in these directories that belong to a plan.
     pub(super) fn new(config: &ImportConfig, plan: &ImportPlan, dirs: &'a [PathBuf]) -> Self {
         Self {
-            plan: hash(config, plan),
+            plan: format!(
+                "{:x}",
+                plan_hash(&config.options, plan, 0..plan.episodes.len()).finalize()
+            ),
             dirs,
             places: [config.out.clone(), config.source.clone()],
         }
@@ -92,18 +96,18 @@ pub fn saved_part_shards(dir: &Path) -> usize {
     fs::read_dir(dir.join("shards")).map_or(0, Iterator::count)
 }
 
-/// The hash of all that decides the shards, but for the images: two machines can have different files in a place.
-fn hash(config: &ImportConfig, plan: &ImportPlan) -> String {
+/// The hash of all that decides the shards with these episodes, but for the images: two machines can have different files in a place.
+pub(super) fn plan_hash(options: &ImportOptions, plan: &ImportPlan, episodes: Range<usize>) -> Sha256 {
     let mut hash = Sha256::new();
     let described = (
         env!("CARGO_PKG_VERSION"),
-        &config.options,
+        options,
         plan.frame_period_s,
         &plan.recording.action_channels,
         &plan.recording.state_channels,
     );
     hash.update(serde_json::to_vec(&described).expect("a description that JSON cannot hold is a bug"));
-    for episode in &plan.episodes {
+    for episode in &plan.episodes[episodes] {
         hash.update((episode.len() as u64).to_le_bytes());
         for frame in episode {
             let record = &plan.recording.records[frame.record];
@@ -114,5 +118,5 @@ fn hash(config: &ImportConfig, plan: &ImportPlan) -> String {
             }
         }
     }
-    format!("{:x}", hash.finalize())
+    hash
 }

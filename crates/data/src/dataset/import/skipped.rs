@@ -104,6 +104,11 @@ impl SkippedList {
         self
     }
 
+    /// How many items there are, also those that are not listed.
+    pub(super) fn count(&self) -> u64 {
+        self.more + self.items.iter().map(|item| item.count).sum::<u64>()
+    }
+
     /// The first item.
     pub(super) fn first(&self) -> Option<&SkippedItem> {
         self.items.first()

@@ -10,7 +10,7 @@ use std::cmp::Ordering;
 use std::ops::{Range, RangeInclusive};
 use std::path::Path;
 
-use super::recording::{Record, Recording};
+use super::recording::{Record, Recording, is_next};
 use super::{ImportError, ImportOptions, SkippedItem};
 use crate::dataset::sampler::GAP_PERIODS;
 
@@ -46,7 +46,7 @@ pub(super) struct PlannedFrame {
 pub(super) fn plan(mut recording: Recording, options: &ImportOptions) -> Result<ImportPlan, ImportError> {
     drop_backward_times(&mut recording, options)?;
     let records = &recording.records;
-    let empty = |name: &Path| ImportError::Empty(name.to_owned());
+    let empty = |path: &Path| nothing_left(path, &recording);
     let name = Path::new(&recording.name);
     let period_s = median_period(records).ok_or_else(|| empty(options.csv.as_deref().unwrap_or(name)))?;
     check_unit(&recording, period_s)?;
@@ -90,6 +90,19 @@ pub(super) fn plan(mut recording: Recording, options: &ImportOptions) -> Result<
         frame_period_s: frame_period_s * options.every as f64,
         episodes,
     })
+}
+
+/// Why no two frames follow each other.
+fn nothing_left(path: &Path, recording: &Recording) -> ImportError {
+    let path = path.to_owned();
+    match recording.skipped.first() {
+        Some(SkippedItem { place, reason, .. }) => ImportError::Scattered {
+            path,
+            left_out: recording.skipped.count(),
+            first: format!("{place}: {reason}"),
+        },
+        _ => ImportError::Empty(path),
+    }
 }
 
 /// Errors: `Option` if the times cannot be in seconds.
@@ -168,11 +181,6 @@ fn drop_backward_times(recording: &mut Recording, options: &ImportOptions) -> Re
 /// Whether the record's time may follow that of `before`.
 fn fits_after(before: Option<&Record>, record: &Record) -> bool {
     before.is_none_or(|before| before.session != record.session || before.timestamp_s < record.timestamp_s)
-}
-
-/// Whether two records can be in one episode: nothing between them was left out.
-fn is_next(before: &Record, now: &Record) -> bool {
-    before.session == now.session && !now.begins_episode
 }
 
 fn median_period(records: &[Record]) -> Option<f64> {

@@ -1,5 +1,5 @@
 //! Writes the planned episodes as shards. What is on disk depends on the source and the options alone, so an import that was
-//! killed continues after its last whole shard.
+//! killed continues after its last whole shard, if that was made from the same source.
 
 use std::fs::{self, File};
 use std::io::ErrorKind;
@@ -7,10 +7,12 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use serde::Serialize;
+use serde_json::Value;
 
 use super::archive::UnpackedSource;
 use super::encoder::{EncodedShard, EpisodeEncoder};
 use super::saved_shards::SavedShards;
+use super::shard_origins::{self, ShardOrigins};
 use super::skipped::{MAX_ITEMS, SkippedItem};
 use super::timing::ImportPlan;
 use super::{ImportConfig, ImportError, ImportOptions};
@@ -28,6 +30,17 @@ pub(super) struct EpisodeSources<'a> {
     pub(super) saved: &'a SavedShards<'a>,
     /// The source that the plan's images are in.
     pub(super) source: &'a UnpackedSource,
+}
+
+impl EpisodeSources<'_> {
+    /// What the source's lists show to be left out, then what was left out of the shards.
+    fn all_skipped(&self, of_shards: Vec<(Option<usize>, SkippedItem)>) -> Vec<(Option<usize>, SkippedItem)> {
+        let listed = self.plan.recording.skipped.items(MAX_ITEMS).into_iter();
+        let listed = listed.map(|item| (None, self.source.item_in_archive(item)));
+        let mut all: Vec<_> = listed.chain(of_shards).collect();
+        all.sort_by_key(|(of, _)| *of);
+        all
+    }
 }
 
 /// What was left out, with the shard in which it would have been; without one, if the source's lists show it.
@@ -124,6 +137,8 @@ impl<'a> Directory<'a> {
         };
         match fs::read_to_string(&path) {
             Ok(found) if found == text => Ok(None),
+            // What was left out is known of each shard.
+            Ok(found) if !out.join(INFO).exists() && are_same_but_for_skip_bad(&found, &text) => Ok(Some(text)),
             // An import that failed before its first shard leaves nothing that is worth keeping.
             Ok(_) if !out.join("data").exists() => Ok(Some(text)),
             Ok(_) => Err(occupied(
@@ -143,6 +158,7 @@ impl<'a> Directory<'a> {
         if !out.join(INFO).exists() {
             return Ok(None);
         }
+        shard_origins::forget(out);
         Ok(Some(Imported {
             info: DatasetMetadata::read(out)?.info_in(out)?,
             skipped: self.read_skipped()?.into_iter().map(|(_, item)| item).collect(),
@@ -192,14 +208,17 @@ impl<'a> Directory<'a> {
         // Those that the source's lists have are found again by every run.
         let mut skipped = self.read_skipped()?;
         skipped.retain(|(of, _)| of.is_some());
+        let mut origins = ShardOrigins::read(self.config, plan, &source.path);
         for episodes in shard_ranges(plan.episodes.iter().map(Vec::len)) {
             let frames: usize = plan.episodes[episodes.clone()].iter().map(Vec::len).sum();
             if cancelled.load(Ordering::Relaxed) {
                 return Err(ImportError::Cancelled { done, total });
             }
-            if !writer.resume(None) {
-                let shard = writer.shard_count();
-                skipped.retain(|(of, _)| *of != Some(shard));
+            let shard = writer.shard_count();
+            let lacks_items = skipped.iter().any(|(of, _)| *of == Some(shard));
+            let is_refused = lacks_items && !self.config.options.skip_bad;
+            if !origins.resume(&mut writer, episodes.clone(), is_refused)? {
+                skipped.retain(|(of, _)| of.is_some_and(|of| of < shard));
                 let on_frames = |frames: usize| {
                     let done = done + frames as u64;
                     on_progress(ImportProgress { done, total });
@@ -230,22 +249,19 @@ impl<'a> Directory<'a> {
             done += frames as u64;
             on_progress(ImportProgress { done, total });
         }
+        origins.discard_rest(&writer)?;
         if writer.episode_count() == 0 {
             return Err(ImportError::Empty(self.config.source.clone()));
         }
-        let listed = plan.recording.skipped.items(MAX_ITEMS).into_iter();
-        let mut all: Vec<(Option<usize>, SkippedItem)> = listed
-            .map(|item| (None, source.item_in_archive(item)))
-            .chain(skipped)
-            .collect();
-        all.sort_by_key(|(of, _)| *of);
+        let all = from.all_skipped(skipped);
         self.write_skipped(&all)?;
         remove_partials(&self.config.out);
         let info = writer.complete()?;
+        shard_origins::forget(&self.config.out);
         Ok(Imported {
             info,
             skipped: all.into_iter().map(|(_, item)| item).collect(),
-            notes: plan.recording.notes.clone(),
+            notes: plan.recording.notes.iter().cloned().chain(origins.note()).collect(),
         })
     }
 
@@ -253,6 +269,16 @@ impl<'a> Directory<'a> {
         let text = serde_json::to_vec_pretty(skipped).expect("a list of texts that JSON cannot hold is a bug");
         Ok(write_atomically(&self.skipped_path(), &text)?)
     }
+}
+
+/// Whether the arguments of two imports are the same, but for that what is damaged may be left out.
+fn are_same_but_for_skip_bad(one: &str, other: &str) -> bool {
+    let parsed = |text: &str| -> Option<Value> {
+        let mut arguments: Value = serde_json::from_str(text).ok()?;
+        *arguments.get_mut("options")?.get_mut("skip_bad")? = Value::Null;
+        Some(arguments)
+    };
+    parsed(one).is_some_and(|one| Some(one) == parsed(other))
 }
 
 /// How many shards an unfinished import has written; a later run continues after them.

@@ -1,5 +1,6 @@
 //! Writes the shards of a data set in order, and the tables and metadata that complete it.
 
+use std::fs;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
@@ -67,6 +68,17 @@ impl ShardWriter {
             self.push(FinishedShard { sha256, records });
         }
         is_same
+    }
+
+    /// Deletes the shards on disk that follow the finished ones, the last first, so that no gap stays. Returns how many there were.
+    /// Errors: `Io`.
+    pub(crate) fn discard_rest(&self) -> Result<usize, DatasetError> {
+        let paths = (self.shards.len()..).map(|shard| self.out.join(shard_path(shard)));
+        let paths: Vec<PathBuf> = paths.take_while(|path| path.is_file()).collect();
+        for path in paths.iter().rev() {
+            fs::remove_file(path).map_err(DatasetError::io("delete", path))?;
+        }
+        Ok(paths.len())
     }
 
     /// Writes the next shard. Errors: `Build`, `Invalid`, `Io`.

@@ -17,6 +17,7 @@ use foreframe_core::error_text;
 use foreframe_core::registry::Manifest;
 use foreframe_core::types::ModelName;
 use foreframe_data::dataset::Dataset;
+use foreframe_data::inspection::small_channels;
 use foreframe_train::evaluation;
 use foreframe_train::training::{self, CHECKPOINT_FILE, TrainConfig, Training, TrainingEvent, TrainingOutcome};
 
@@ -66,6 +67,7 @@ impl Pipeline {
             .map(|(name, weight)| Ok((self.dataset(name, held_mib, &retry)?, weight)));
         let opened = opened.collect::<Result<_, JobFailure>>()?;
         let dataset = Dataset::join(opened, config.lacking()).map_err(|error| failed(&error))?;
+        small_channels(&dataset).into_iter().for_each(|line| report.line(line));
         let work = TrainingWork {
             spec: base.as_ref().map_or(&job, |base| &base.spec),
             config: &config,

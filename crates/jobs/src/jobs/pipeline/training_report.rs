@@ -2,10 +2,7 @@
 
 use super::super::report::JobReporter;
 use crate::store::LossRow;
-use foreframe_train::training::{TrainingEvent, TrainingStage};
-
-/// How many points of the training loss are stored for each stage, besides those of its validations.
-const CURVE_POINTS: usize = 500;
+use foreframe_train::training::{CURVE_POINTS, TrainingEvent, TrainingStage};
 
 /// Turns a training's events into the job's report.
 pub(super) struct TrainingReporter<'a> {

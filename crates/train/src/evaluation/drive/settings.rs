@@ -1,71 +1,38 @@
 //! Which episodes are driven, and by whom.
 
-use std::str::FromStr;
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
 use super::error::DriveError;
+use foreframe_core::named_enum;
 use foreframe_core::registry::Model;
 use foreframe_core::types::Seed;
 use foreframe_sim::{RoomSet, Scenario, action_channels, state_channels};
 
-/// What chooses the commands.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum DriverKind {
-    /// Straight to the goal, by two PID controllers; sees nothing.
-    Pid,
-    /// As `pid`, but stands while the model's depth network sees something on its way within the next second.
-    Stop,
-    /// As `plan`, but movers are expected to go on as fast as in the last frames, instead of as the model predicts. Those that
-    /// have left the picture are remembered.
-    Velocity,
-    /// As `velocity`, but knows the true place, size and speed of each robot that the camera shows now, and remembers none.
-    Visible,
-    /// As `visible`, but knows that of every robot, also of those that the camera does not show.
-    Places,
-    /// Follows the plan that the model finds, and plans anew at every frame.
-    Plan,
-    /// Plans with the simulator itself as the model: it knows where everything will be. The upper limit.
-    Simulator,
-}
-
-impl DriverKind {
-    /// All drivers.
-    pub const ALL: [Self; 7] = [
-        Self::Pid,
-        Self::Stop,
-        Self::Velocity,
-        Self::Visible,
-        Self::Places,
-        Self::Plan,
-        Self::Simulator,
-    ];
-
-    /// Its name.
-    #[must_use]
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Pid => "pid",
-            Self::Stop => "stop",
-            Self::Velocity => "velocity",
-            Self::Visible => "visible",
-            Self::Places => "places",
-            Self::Plan => "plan",
-            Self::Simulator => "simulator",
-        }
+named_enum! {
+    /// What chooses the commands.
+    #[derive(Serialize, Deserialize)]
+    #[serde(rename_all = "kebab-case")]
+    pub enum DriverKind {
+        /// Straight to the goal, by two PID controllers; sees nothing.
+        Pid = "pid",
+        /// As `pid`, but stands while the model's depth network sees something on its way within the next second.
+        Stop = "stop",
+        /// As `plan`, but movers are expected to go on as fast as in the last frames, instead of as the model predicts. Those that
+        /// have left the picture are remembered.
+        Velocity = "velocity",
+        /// As `velocity`, but knows the true place, size and speed of each robot that the camera shows now, and remembers none.
+        Visible = "visible",
+        /// As `visible`, but knows that of every robot, also of those that the camera does not show.
+        Places = "places",
+        /// Follows the plan that the model finds, and plans anew at every frame.
+        Plan = "plan",
+        /// Plans with the simulator itself as the model: it knows where everything will be. The upper limit.
+        Simulator = "simulator",
     }
-}
-
-impl FromStr for DriverKind {
-    type Err = String;
-
-    fn from_str(name: &str) -> Result<Self, String> {
-        let found = Self::ALL.into_iter().find(|driver| driver.name() == name);
-        found.ok_or_else(|| {
-            format!("there is no driver {name:?}; there are: pid, stop, velocity, visible, places, plan, simulator")
-        })
+    else |name| -> String {
+        format!("there is no driver {name:?}; there are: {}", Self::ALL.map(Self::name).join(", "))
     }
 }
 

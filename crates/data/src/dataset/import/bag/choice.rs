@@ -2,12 +2,10 @@
 
 use super::index::{BagIndex, Content, MessageEntry, Topic, ValueStream};
 use super::messages::{Projection, RosType};
+use crate::dataset::import::options::are_none;
 use crate::dataset::import::skipped::listed;
 use crate::dataset::import::{ImportError, ImportOptions};
 use foreframe_core::types::Channel;
-
-/// In place of a topic: none at all.
-const NONE: &str = "none";
 
 /// A topic of values, and which of its fields are used.
 pub(super) struct ChosenValues<'a> {
@@ -152,7 +150,7 @@ impl<'a> Choice<'a> {
                 let only = self.only(role)?.into_iter();
                 only.map(|found| self.fields(found, None, false)).collect()
             }
-            [one] if one == NONE => Ok(Vec::new()),
+            names if are_none(names) => Ok(Vec::new()),
             many => {
                 let choose = |text: &String| {
                     let (name, fields) = match text.split_once(':') {

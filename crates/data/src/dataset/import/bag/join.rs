@@ -10,7 +10,7 @@ use std::ops::Range;
 
 use super::choice::{ChosenTopics, ChosenValues};
 use super::index::{BagIndex, MessageTime, Position};
-use crate::dataset::import::recording::Record;
+use crate::dataset::import::recording::{Record, any_follow};
 use crate::dataset::import::skipped::{SkippedItem, SkippedList};
 use crate::dataset::import::timing::median;
 use crate::dataset::import::{ImportError, ImportOptions};
@@ -100,6 +100,20 @@ impl<'a> HeldValues<'a> {
             }
         }
         Ok(held)
+    }
+
+    /// For images of which no two consecutive ones have a value. Errors: `Option` if the values come too seldom for that.
+    fn check_period(&self, image: &str, option: &str) -> Result<(), ImportError> {
+        let steps = self.times_ns.windows(2).map(|pair| pair[1] - pair[0]);
+        let period_ns = median(steps.collect(), i64::cmp).filter(|period_ns| *period_ns > self.hold_ns);
+        period_ns.map_or(Ok(()), |period_ns| {
+            let (topic, hold_s) = (self.topic, seconds(self.hold_ns));
+            Err(ImportError::Option(format!(
+                "no two consecutive images of {image} have a value of {topic}: its values come every {:.3} s (median) and hold for \
+                 {hold_s} s; let them hold longer with --hold, or leave the topic out with {option} none",
+                seconds(period_ns)
+            )))
+        })
     }
 
     /// The message that holds at a time.
@@ -195,6 +209,14 @@ pub(super) fn join(index: &BagIndex<'_>, chosen: &ChosenTopics<'_>) -> Result<Jo
         });
         joined.positions.push((entry.file, entry.position));
         next_number = entry.number + 1;
+    }
+    if !any_follow(&joined.records) {
+        for (option, held) in [("--action", &actions), ("--state", &states)] {
+            let mut seldom = held
+                .iter()
+                .filter(|held| left_out.iter().any(|(topic, _)| *topic == held.topic));
+            seldom.try_for_each(|held| held.check_period(&chosen.image.name, option))?;
+        }
     }
     let (source, hold_s) = (index.source.display(), index.options.hold_s);
     for (topic, run) in left_out {

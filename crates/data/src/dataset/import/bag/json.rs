@@ -139,7 +139,7 @@ fn collect(value: &Value, name: &str, fields: &mut Vec<FieldValue>) -> Result<()
     }
 }
 
-fn read<'a, T: Deserialize<'a>>(message: &'a [u8]) -> Result<T, String> {
+pub(super) fn read<'a, T: Deserialize<'a>>(message: &'a [u8]) -> Result<T, String> {
     serde_json::from_slice(message).map_err(|error| error.to_string())
 }
 

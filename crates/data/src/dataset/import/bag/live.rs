@@ -4,6 +4,7 @@
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use serde::Deserialize;
+use serde_json::Value;
 
 use super::json;
 use super::messages::{self, RosType};
@@ -31,7 +32,8 @@ enum MessageDecoder {
     Ros(RosType),
     FoxgloveRawImage,
     FoxgloveCompressedImage,
-    JsonImage,
+    JsonRawImage,
+    JsonCompressedImage,
     /// An action or a state of ROS 2 in JSON.
     JsonRos(RosType),
     JsonPose,
@@ -63,7 +65,8 @@ impl LiveType {
         let decoder = match (encoding, type_name) {
             ("protobuf", "foxglove.RawImage") => MessageDecoder::FoxgloveRawImage,
             ("protobuf", "foxglove.CompressedImage") => MessageDecoder::FoxgloveCompressedImage,
-            ("json", "foxglove.RawImage" | "foxglove.CompressedImage") => MessageDecoder::JsonImage,
+            ("json", "foxglove.RawImage") => MessageDecoder::JsonRawImage,
+            ("json", "foxglove.CompressedImage") => MessageDecoder::JsonCompressedImage,
             ("json", "foxglove.PoseInFrame") => MessageDecoder::JsonPose,
             (encoding, name) => match (encoding, RosType::of(name)) {
                 ("json", RosType::Other) => MessageDecoder::JsonNumbers,
@@ -88,9 +91,10 @@ impl LiveType {
                 LiveRole::Measurement
             }),
             MessageDecoder::JsonPose | MessageDecoder::JsonNumbers => None,
-            MessageDecoder::FoxgloveRawImage | MessageDecoder::FoxgloveCompressedImage | MessageDecoder::JsonImage => {
-                Some(LiveRole::Image)
-            }
+            MessageDecoder::FoxgloveRawImage
+            | MessageDecoder::FoxgloveCompressedImage
+            | MessageDecoder::JsonRawImage
+            | MessageDecoder::JsonCompressedImage => Some(LiveRole::Image),
         }
     }
 
@@ -102,9 +106,14 @@ impl LiveType {
 
     /// The image of a message, in gray. Errors: why it cannot be read, or that it holds numbers.
     pub fn image(self, message: &[u8]) -> Result<Frame, String> {
+        let json_file;
         let file = match self.0 {
             MessageDecoder::Ros(RosType::Image) => return messages::image(message)?.1.gray(),
-            MessageDecoder::JsonImage => return json_image(message),
+            MessageDecoder::JsonRawImage => return json_raw_image(message),
+            MessageDecoder::JsonCompressedImage => {
+                json_file = json::read::<JsonCompressedImage>(message)?.data.bytes()?;
+                &json_file
+            }
             MessageDecoder::FoxgloveRawImage => return raw_image(message)?.gray(),
             MessageDecoder::Ros(RosType::CompressedImage) => messages::compressed_image(message)?.2,
             MessageDecoder::FoxgloveCompressedImage => bytes_of(message, COMPRESSED_DATA).unwrap_or_default(),
@@ -143,46 +152,59 @@ fn raw_image(message: &[u8]) -> Result<RawImage<'_>, String> {
     })
 }
 
-/// An image of Foxglove in JSON, compressed or raw. Unknown fields are ignored: time and coordinate frame.
-#[derive(Deserialize)]
-struct JsonImage {
-    /// In base64.
-    data: String,
-    #[serde(flatten)]
-    raw: Option<JsonPixels>,
-}
+// Images of Foxglove in JSON. Other fields are ignored: time and coordinate frame.
 
-/// What only a raw image has.
+/// Bytes in base64.
 #[derive(Deserialize)]
-struct JsonPixels {
-    width: u32,
-    height: u32,
-    encoding: String,
-    step: u32,
-}
+struct Base64(String);
 
-fn json_image(message: &[u8]) -> Result<Frame, String> {
-    let JsonImage { data, raw } = serde_json::from_slice(message).map_err(|error| error.to_string())?;
-    let bytes = STANDARD
-        .decode(data)
-        .map_err(|error| format!("its data is not base64: {error}"))?;
-    match raw {
-        None => codec::decode(&bytes).map_err(|error| error.to_string()),
-        Some(JsonPixels {
-            width,
-            height,
-            encoding,
-            step,
-        }) => RawImage {
-            width_px: width,
-            height_px: height,
-            encoding: &encoding,
-            big_endian: false,
-            row_bytes: step,
-            bytes: &bytes,
-        }
-        .gray(),
+impl Base64 {
+    fn bytes(self) -> Result<Vec<u8>, String> {
+        let decoded = STANDARD.decode(self.0);
+        decoded.map_err(|error| format!("its data is not base64: {error}"))
     }
+}
+
+#[derive(Deserialize)]
+struct JsonCompressedImage {
+    data: Base64,
+}
+
+#[derive(Deserialize)]
+struct JsonRawImage {
+    data: Base64,
+    encoding: String,
+    // Read later: the errors of a whole message do not say which field is wrong.
+    #[serde(default)]
+    width: Value,
+    #[serde(default)]
+    height: Value,
+    #[serde(default)]
+    step: Value,
+}
+
+fn json_raw_image(message: &[u8]) -> Result<Frame, String> {
+    let image = json::read::<JsonRawImage>(message)?;
+    let number = |name, value: &Value| {
+        let whole = value.as_u64().and_then(|number| u32::try_from(number).ok());
+        whole.ok_or_else(|| {
+            let found = if value.is_null() {
+                "is missing"
+            } else {
+                "is no whole number"
+            };
+            format!("its {name} {found}; a foxglove.RawImage has width and height in px, and step: the bytes of a row")
+        })
+    };
+    let raw = RawImage {
+        width_px: number("width", &image.width)?,
+        height_px: number("height", &image.height)?,
+        encoding: &image.encoding,
+        big_endian: false,
+        row_bytes: number("step", &image.step)?,
+        bytes: &image.data.bytes()?,
+    };
+    raw.gray()
 }
 
 #[cfg(test)]
@@ -213,7 +235,9 @@ mod tests {
         let message = format!(r#"{{{time},"format":"png","data":"{png}"}}"#);
         assert_eq!(compressed.image(message.as_bytes()).unwrap().pixels(), b"abcdef");
         for wrong in ["", "{}", r#"{"data":"?"}"#, r#"{"data":""}"#] {
-            assert!(raw.image(wrong.as_bytes()).is_err(), "{wrong}");
+            for kind in [raw, compressed] {
+                assert!(kind.image(wrong.as_bytes()).is_err(), "{wrong}");
+            }
         }
     }
 

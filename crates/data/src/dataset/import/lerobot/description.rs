@@ -7,6 +7,7 @@ use serde::Deserialize;
 use serde_json::Value;
 
 use crate::dataset::import::files::read_file;
+use crate::dataset::import::options::are_none;
 use crate::dataset::import::skipped::listed;
 use crate::dataset::import::{ImportError, ImportOptions};
 
@@ -132,6 +133,9 @@ impl Description {
         default: &str,
         option: &str,
     ) -> Result<Vec<Component>, ImportError> {
+        if are_none(wanted) {
+            return Ok(Vec::new());
+        }
         let vectors = || self.info.features.iter().filter(|(_, feature)| feature.is_vector());
         let all = |(name, feature): (&String, &Feature)| feature.components(name);
         if wanted.is_empty() {
@@ -153,6 +157,24 @@ impl Description {
             })?);
         }
         Ok(components)
+    }
+}
+
+/// The features that become the action and the state, if no others are named.
+pub(super) const ACTION: &str = "action";
+pub(super) const STATE: &str = "observation.state";
+
+impl Description {
+    /// What is said about action and state if they should have been found by name, but are no numbers.
+    pub(super) fn notes(&self, options: &ImportOptions) -> Vec<String> {
+        let found = [(ACTION, &options.actions), (STATE, &options.states)].into_iter();
+        let unread = found.filter_map(|(name, wanted)| {
+            let feature = self.info.features.get(name).filter(|feature| !feature.is_vector())?;
+            let (kind, shape) = (&feature.dtype, &feature.shape);
+            let note = format!("the feature {name:?} is no list of numbers (its type is {kind}, its shape {shape:?}), so it was not imported");
+            wanted.is_empty().then_some(note)
+        });
+        unread.collect()
     }
 }
 

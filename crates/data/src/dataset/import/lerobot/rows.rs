@@ -61,7 +61,8 @@ pub(super) fn read_rows(path: &Path, name: &Path, components: &[Component]) -> R
         let batch = batch.map_err(|error| wrong(&error))?;
         append(&batch, components, &mut rows).map_err(|column| {
             wrong(&format!(
-                "column {column:?} does not hold one list of numbers in every row, as its feature states"
+                "column {column:?} does not hold one list of numbers in every row, as its feature states (--action and \
+                 --state choose other features, or none)"
             ))
         })?;
     }
