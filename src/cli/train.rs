@@ -93,19 +93,9 @@ pub(super) fn run(args: &TrainArgs) -> Result<(), CliError> {
     if args.print_config {
         return print_line(config.to_toml()?.trim_end());
     }
-    let mut named = args.datasets.clone();
-    if named.is_empty() {
-        named.push(WeightedDataset::from(default_dataset(args, start.as_ref())));
-    }
-    let mut weighted = Vec::new();
-    let mut directories = Vec::new();
-    for WeightedDataset { place, weight } in &named {
-        let (directory, dataset) = workspace.open_dataset(place)?;
-        directories.push(directory);
-        weighted.push((dataset, *weight));
-    }
-    let dataset = Dataset::join(weighted, config.lacking())?;
+    let (directories, dataset) = open_datasets(args, &workspace, start.as_ref(), &config)?;
     for config in &configs {
+        config.validate()?;
         training::parameter_count(config, dataset.info())?;
     }
     warn_of(&dataset);
@@ -133,30 +123,46 @@ pub(super) fn run(args: &TrainArgs) -> Result<(), CliError> {
         return sweep::print_table(&finished, &flags);
     }
     let (model_dir, manifest) = one.run(&config, &run_dir)?;
-    let parts = dataset.parts();
-    let (mut evaluations, mut unfit) = (String::new(), Vec::new());
-    for (directory, part) in directories.iter().zip(&parts) {
-        if let Err(error) = evaluation::check_fit(&manifest, &part.info) {
-            unfit.push(error.to_string());
-            continue;
-        }
-        let (model, dataset) = (shell_path(&model_dir), shell_path(directory));
-        evaluations += &format!("foreframe evaluate --model {model} --dataset {dataset}{flags}\n      ");
-    }
-    for reason in unfit {
-        print_line(format!(
-            "note: the model cannot be evaluated on one of its data sets: {reason}"
-        ))?;
-    }
     print_line(format!(
-        "{}: {} parameters, validation MSE {:.6} at step {}\nnext: {}foreframe publish {}{flags}",
+        "{}: {} parameters, validation MSE {:.6} at step {}",
         model_dir.display(),
         manifest.parameters,
         manifest.metrics["validation"]["mse"].as_f64().unwrap_or(f64::NAN),
         manifest.metrics["validation"]["step"],
-        evaluations,
-        shell_path(&run_dir),
-    ))
+    ))?;
+    let mut next = Vec::new();
+    for (directory, part) in directories.iter().zip(dataset.parts()) {
+        if let Err(reason) = evaluation::check_fit(&manifest, &part.info) {
+            print_line(format!(
+                "note: the model cannot be evaluated on one of its data sets: {reason}"
+            ))?;
+            continue;
+        }
+        let (model, dataset) = (shell_path(&model_dir), shell_path(directory));
+        next.push(format!("foreframe evaluate --model {model} --dataset {dataset}{flags}"));
+    }
+    next.push(format!("foreframe publish {}{flags}", shell_path(&run_dir)));
+    print_line(format!("next: {}", next.join("\n      ")))
+}
+
+/// The data sets that are named, as one, and their directories.
+fn open_datasets(
+    args: &TrainArgs,
+    workspace: &Workspace,
+    start: Option<&StoredWeights>,
+    config: &TrainConfig,
+) -> Result<(Vec<PathBuf>, Dataset), CliError> {
+    let mut named = args.datasets.clone();
+    if named.is_empty() {
+        named.push(WeightedDataset::from(default_dataset(args, start)));
+    }
+    let (mut directories, mut weighted) = (Vec::new(), Vec::new());
+    for WeightedDataset { place, weight } in &named {
+        let (directory, dataset) = workspace.open_dataset(place)?;
+        directories.push(directory);
+        weighted.push((dataset, *weight));
+    }
+    Ok((directories, Dataset::join(weighted, config.lacking())?))
 }
 
 /// Warns of channels that the networks see too small.

@@ -95,7 +95,7 @@ fn usage_errors_exit_with_2_and_advice() {
         ),
         ("train --set sequence.steps=many", "sequence.steps"),
         ("train --set sequence.steps=0", "sequence.steps is 0; it must be 1 to"),
-        ("train --set model.context=0", "the context is 0; it must be at least 1"),
+        ("train --set model.context=0", "context is 0; it must be 1 to 256"),
         ("train --config none.toml", "could not read none.toml: No such file"),
         (
             "train --set sequence.stepz=1",
@@ -524,8 +524,8 @@ fn every_command_finds_what_is_in_the_data_directory() {
 fn an_evaluation_s_numbers_have_limits() {
     let dir = working_dir();
     for (option, value, right) in [
-        ("--resamples", "10001", "10001 is not in 1..=10000"),
-        ("--resamples", "0", "0 is not in 1..=10000"),
+        ("--resamples", "10001", "10001 is not in 100..=10000"),
+        ("--resamples", "99", "99 is not in 100..=10000"),
         ("--min-skill", "nan", "a skill is a number of at most 1"),
         ("--min-skill", "5", "a skill is a number of at most 1"),
         ("--brightness", "0", "a brightness is a number from 0.1 to 3"),

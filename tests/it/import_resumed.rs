@@ -74,7 +74,7 @@ impl Recording {
 }
 
 fn is_told(imported: &Imported) -> bool {
-    imported.notes.iter().any(|note| note.contains("imported anew"))
+    imported.notes.iter().any(|note| note.contains("were made again"))
 }
 
 #[test]

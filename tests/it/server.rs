@@ -249,7 +249,10 @@ async fn a_prediction_past_its_deadline_is_answered_503() {
     let asked = (0..20).map(|_| post(&app, "/v1/models/slow/predict", &body));
     let answers = futures_util::future::join_all(asked).await;
     let late = answers.iter().find(|answer| answer.status == 503).unwrap();
-    assert!(late.detail(503).starts_with("no prediction within 1 ms (setting prediction_deadline_ms)"));
+    assert!(
+        late.detail(503)
+            .starts_with("no prediction within 1 ms (setting prediction_deadline_ms)")
+    );
     assert_eq!(late.headers[header::RETRY_AFTER], "1");
 }
 

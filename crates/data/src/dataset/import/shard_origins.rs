@@ -50,7 +50,8 @@ impl<'a> ShardOrigins<'a> {
             },
             path,
             hashes: hashes.unwrap_or_default(),
-            source: (is_unpacked || !has_files).then(|| stamps(&config.source)),
+            source: (is_unpacked || !has_files)
+                .then(|| stamps(&config.source, config.out.canonicalize().ok().as_deref())),
             discarded: 0,
         }
     }
@@ -84,7 +85,7 @@ impl<'a> ShardOrigins<'a> {
     pub(super) fn note(&self) -> Option<String> {
         (self.discarded > 0).then(|| {
             format!(
-                "shards that an earlier run had saved ({}) are not of the recording as it is now; their frames were imported anew",
+                "{} saved shards of an earlier run did not fit the recording or the options, and were made again",
                 self.discarded
             )
         })
@@ -111,13 +112,17 @@ pub(super) fn forget(out: &Path) {
     let _ = fs::remove_file(out.join(ORIGINS));
 }
 
-/// The stamp of a file, or those of all files in a folder.
-fn stamps(source: &Path) -> String {
+/// The stamp of a file, or those of all files in a folder, without the folder `out`, which the import writes.
+fn stamps(source: &Path, out: Option<&Path>) -> String {
     let mut text = stamp(source);
     for path in entries(source).unwrap_or_default() {
         // Links to folders are not followed: they can lead in a circle.
         let is_folder = path.symlink_metadata().is_ok_and(|found| found.is_dir());
-        text += &if is_folder { stamps(&path) } else { stamp(&path) };
+        if !is_folder {
+            text += &stamp(&path);
+        } else if path.canonicalize().ok().as_deref() != out {
+            text += &stamps(&path, out);
+        }
     }
     text
 }
@@ -142,9 +147,13 @@ mod tests {
         let inner = dir.path().join("videos");
         fs::create_dir(&inner).unwrap();
         fs::write(inner.join("a.mp4"), "1").unwrap();
-        let before = stamps(dir.path());
-        assert_eq!(stamps(dir.path()), before);
+        let out = inner.canonicalize().unwrap().join("set");
+        fs::create_dir(&out).unwrap();
+        let stamps = || stamps(dir.path(), Some(&out));
+        let before = stamps();
+        fs::write(out.join("shard"), "1").unwrap();
+        assert_eq!(stamps(), before);
         fs::write(inner.join("a.mp4"), "22").unwrap();
-        assert_ne!(stamps(dir.path()), before);
+        assert_ne!(stamps(), before);
     }
 }

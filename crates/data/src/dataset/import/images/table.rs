@@ -296,7 +296,10 @@ fn finite(text: &str) -> Option<f64> {
 impl Columns {
     /// Leaves out these columns where they were found by name, as `options` say.
     pub(super) fn leave_out(&mut self, texts: &[TextColumn], options: &ImportOptions) {
-        for (columns, named) in [(&mut self.actions, &options.actions), (&mut self.states, &options.states)] {
+        for (columns, named) in [
+            (&mut self.actions, &options.actions),
+            (&mut self.states, &options.states),
+        ] {
             columns.retain(|column| !named.is_empty() || texts.iter().all(|text| text.column != *column));
         }
     }
