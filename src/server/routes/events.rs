@@ -80,25 +80,20 @@ struct ServerEventStream {
 impl ServerEventStream {
     /// The name of the next event; none if the key was revoked or the store failed: the client may connect again.
     async fn next(&mut self) -> Option<&'static str> {
-        let mut pause = Duration::ZERO;
         loop {
             let lists = &self.app.compared_lists;
-            let reading = async {
-                tokio::time::sleep(pause).await;
-                lists.not_older(COMPARE_EVERY, hashes(&self.app)).await
-            };
-            let now = tokio::select! {
-                now = reading => now?,
-                () = stop_requested(&mut self.stopping) => return Some(STOPPING),
-                () = self.app.keys.revoked(self.caller) => return None,
-            };
+            let now = lists.not_older(COMPARE_EVERY, hashes(&self.app)).await?;
             for (place, name) in ["models", "jobs"].into_iter().enumerate() {
                 if self.sent[place] != Some(now[place]) {
                     self.sent[place] = Some(now[place]);
                     return Some(name);
                 }
             }
-            pause = COMPARE_EVERY;
+            tokio::select! {
+                () = tokio::time::sleep(COMPARE_EVERY) => {}
+                () = stop_requested(&mut self.stopping) => return Some(STOPPING),
+                () = self.app.keys.revoked(self.caller) => return None,
+            }
         }
     }
 }

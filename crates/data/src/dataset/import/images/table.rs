@@ -225,9 +225,10 @@ impl Header<'_> {
         let name = |column: usize| name_and_unit(&self.names[column]).0;
         let of_text = |text: &TextColumn| {
             let (column, first) = (name(text.column), shortened(&text.first, QUOTED_BYTES));
-            let why = match text.first.is_empty() {
-                true => "is empty".to_owned(),
-                false => format!("holds no numbers (its first value is {first:?})"),
+            let why = if text.first.is_empty() {
+                "is empty".to_owned()
+            } else {
+                format!("holds no numbers (its first value is {first:?})")
             };
             format!("the column {column:?} of {csv} {why}, so it was not imported")
         };
