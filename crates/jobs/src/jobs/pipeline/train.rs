@@ -67,7 +67,9 @@ impl Pipeline {
             .map(|(name, weight)| Ok((self.dataset(name, held_mib, &retry)?, weight)));
         let opened = opened.collect::<Result<_, JobFailure>>()?;
         let dataset = Dataset::join(opened, config.lacking()).map_err(|error| failed(&error))?;
-        small_channels(&dataset).into_iter().for_each(|line| report.line(line));
+        for line in small_channels(&dataset) {
+            report.line(line);
+        }
         let work = TrainingWork {
             spec: base.as_ref().map_or(&job, |base| &base.spec),
             config: &config,
