@@ -109,15 +109,13 @@ fn report_models(app: &App) {
 
 /// Creates a key and prints it; to standard output only, not to the log. Another server that starts now may have done it.
 async fn print_first_key(store: &Store) -> Result<(), CliError> {
-    match create_first_key(store).await? {
-        Some(key) => print_line(format!(
-            "API key, printed this once: {key} — create others with foreframe keys create NAME, and then revoke this one"
-        )),
-        None => {
-            info!("another server made the first API key, and printed it");
-            Ok(())
-        }
-    }
+    let Some(key) = create_first_key(store).await? else {
+        info!("another server made the first API key, and printed it");
+        return Ok(());
+    };
+    print_line(format!(
+        "API key, printed this once: {key} — create others with foreframe keys create NAME, and then revoke this one"
+    ))
 }
 
 /// The API keys. Errors: `Usage` if other machines can reach the server and there is no key.
