@@ -84,7 +84,7 @@ fn damage_in_every_second_line_is_named() {
     let csv = source.join("log.csv");
     let text = fs::read_to_string(&csv).unwrap();
     let damage = |(index, line): (usize, &str)| match index % 2 {
-        0 if index > 0 => format!("{}x\n", line),
+        0 if index > 0 => format!("{line}x\n"),
         _ => format!("{line}\n"),
     };
     fs::write(&csv, text.lines().enumerate().map(damage).collect::<String>()).unwrap();
