@@ -569,7 +569,7 @@ fn key(id: &str, scope: KeyScope) -> KeyRow {
 
 #[tokio::test]
 async fn of_servers_that_start_at_once_one_makes_the_first_key() {
-    for (_dir, store) in stores("first-key").await {
+    for (_dir, store) in stores("first_key").await {
         let add = async |id| {
             let added = store
                 .add_first_key(key(id, KeyScope::Admin), &Author::CommandLine)
