@@ -63,7 +63,7 @@ impl Uploads {
         threads: &BlockingWork,
     ) -> Result<u64, ApiError> {
         let path = file.path(self.dir.parent().unwrap_or(&self.dir));
-        let place = self.place(&path, sender, threads).await?;
+        let place = self.place(file, sender, threads).await?;
         let opened = threads.run(move || PartialFile::create(path)).await?;
         let PartialFile {
             partial,
@@ -119,27 +119,25 @@ impl Uploads {
     }
 
     /// Makes the directory of an upload. Errors: `Unavailable`, `TooMany`.
-    async fn place(&self, path: &Path, sender: Caller, threads: &BlockingWork) -> Result<UploadPlace, ApiError> {
+    async fn place(
+        &self,
+        file: &UploadedFile,
+        sender: Caller,
+        threads: &BlockingWork,
+    ) -> Result<UploadPlace, ApiError> {
         let mut senders = self.senders.lock().await;
         let uploads = self.dir.clone();
         let listed = threads.run(move || names(&uploads)).await?;
         let present = listed.map_err(|error| away(&self.dir, error))?;
         senders.retain(|id, _| present.contains(id));
         self.check_places(present.len(), sender, &senders)?;
-        let place = UploadPlace {
-            dir: path.parent().map(Path::to_owned),
-        };
-        let id = place
-            .dir
-            .as_deref()
-            .and_then(Path::file_name)
-            .map(|id| id.to_string_lossy().into_owned());
+        let dir = self.dir.join(file.id());
         let made = threads.run(move || {
-            place.dir.as_deref().map_or(Ok(()), fs::create_dir_all)?;
-            Ok(place)
+            let place = UploadPlace { dir: Some(dir.clone()) };
+            fs::create_dir_all(dir).map(|()| place)
         });
         let place = made.await?.map_err(|error: io::Error| away(&self.dir, error))?;
-        senders.extend(id.map(|id| (id, sender)));
+        senders.insert(file.id().to_owned(), sender);
         Ok(place)
     }
 
@@ -212,10 +210,7 @@ impl Uploads {
         for name in names {
             if self.is_over(&name, &imports) {
                 objects.delete(&format!("{UPLOADS_DIR}/{name}")).await?;
-                info!(
-                    upload = name,
-                    "deleted an upload: its import has ended, none began, or it was deleted elsewhere"
-                );
+                info!(upload = name, "deleted an upload: its import has ended, or none began");
             }
         }
         Ok(())

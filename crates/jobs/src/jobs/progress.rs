@@ -107,7 +107,7 @@ impl ReportBuffer {
                 last.train = losses.train.or(last.train);
                 last.validation = losses.validation.or(last.validation);
             }
-            ReportEvent::Waiting(reason) => self.set_waiting(reason),
+            ReportEvent::Waiting(message) => self.set_waiting(message),
             ReportEvent::Line(line) => {
                 self.changes += 1;
                 push(&mut self.lines, (now_s, line));
@@ -123,16 +123,16 @@ impl ReportBuffer {
         }
     }
 
-    fn set_waiting(&mut self, reason: Option<String>) {
+    fn set_waiting(&mut self, message: Option<String>) {
         let progress = &mut self.stored.progress;
-        let Some(reason) = reason else {
+        let Some(message) = message else {
             if let Some(before) = self.before_wait.take() {
                 progress.message = before;
             }
             return;
         };
         progress.remaining_s = None;
-        let before = std::mem::replace(&mut progress.message, format!("waiting for the store: {reason}"));
+        let before = std::mem::replace(&mut progress.message, message);
         self.before_wait.get_or_insert(before);
     }
 
@@ -257,12 +257,12 @@ mod tests {
         let mut buffer = ReportBuffer::default();
         let message = |buffer: &ReportBuffer| buffer.stored().progress.message.clone();
         buffer.progress(1, 9, "sequence", 1.0);
-        buffer.apply(ReportEvent::Waiting(Some("the disk is full".to_owned())), 2.0);
-        assert_eq!(message(&buffer), "waiting for the store: the disk is full");
+        buffer.apply(ReportEvent::Waiting(Some("waiting for the disk".to_owned())), 2.0);
+        assert_eq!(message(&buffer), "waiting for the disk");
         buffer.apply(ReportEvent::Waiting(None), 3.0);
         assert_eq!(message(&buffer), "sequence");
         // What was reported meanwhile stays.
-        buffer.apply(ReportEvent::Waiting(Some("the disk is full".to_owned())), 4.0);
+        buffer.apply(ReportEvent::Waiting(Some("waiting for the disk".to_owned())), 4.0);
         buffer.progress(2, 9, "evaluation", 5.0);
         buffer.apply(ReportEvent::Waiting(None), 6.0);
         assert_eq!(message(&buffer), "evaluation");

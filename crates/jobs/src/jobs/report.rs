@@ -68,9 +68,9 @@ impl JobReporter {
         self.apply(ReportEvent::Losses(Losses { train, validation }));
     }
 
-    /// Sets what the job waits for; `None` once it goes on.
-    pub(super) fn waiting(&self, reason: Option<String>) {
-        self.apply(ReportEvent::Waiting(reason));
+    /// Says what the job waits for instead of what it does; `None` once it goes on.
+    pub(super) fn waiting(&self, message: Option<String>) {
+        self.apply(ReportEvent::Waiting(message));
     }
 
     /// Adds a line to the job's log.

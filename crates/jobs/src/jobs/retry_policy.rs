@@ -78,8 +78,9 @@ impl RetryPolicy<'_> {
             }
             if away_since.is_none() {
                 warn!(reason, "a job waits for the store");
-                self.report.line(format!("waiting for the store: {reason}"));
-                self.report.waiting(Some(reason));
+                let waiting = format!("waiting for the store: {reason}");
+                self.report.line(waiting.clone());
+                self.report.waiting(Some(waiting));
                 (*away_since, pause) = (Some(Instant::now()), FIRST_PAUSE);
             }
             let paused = Instant::now();

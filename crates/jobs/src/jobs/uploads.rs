@@ -66,6 +66,12 @@ impl UploadedFile {
         Some(source.strip_prefix(SCHEME)?.parse())
     }
 
+    /// Its id.
+    #[must_use]
+    pub fn id(&self) -> &str {
+        &self.id
+    }
+
     /// The key of its directory.
     #[must_use]
     pub fn key(&self) -> String {
