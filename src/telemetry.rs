@@ -9,28 +9,20 @@ mod prometheus;
 use serde::{Deserialize, Serialize};
 
 use foreframe_core::error_kind::{ErrorKind, HasErrorKind};
+use foreframe_core::named_enum;
 
 pub use prometheus::{install_recorder, render, run_upkeep};
 
-/// Format of log lines.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum LogFormat {
-    /// Text for people.
-    #[default]
-    Text,
-    /// One JSON object per line.
-    Json,
-}
-
-impl LogFormat {
-    /// As in the setting `log_format`.
-    #[must_use]
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Text => "text",
-            Self::Json => "json",
-        }
+named_enum! {
+    /// Format of log lines.
+    #[derive(Default, Serialize, Deserialize)]
+    #[serde(rename_all = "lowercase")]
+    pub enum LogFormat {
+        /// Text for people.
+        #[default]
+        Text = "text",
+        /// One JSON object per line.
+        Json = "json",
     }
 }
 

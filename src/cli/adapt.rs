@@ -8,7 +8,7 @@ use super::interrupt;
 use super::next_step::{name_from, shell_path};
 use super::process::{command_line, print_line};
 use super::settings::DirectoryArgs;
-use super::train::{OneTraining, warn_of};
+use super::train::{OneTraining, warn_of_small_channels};
 use super::workspace::Workspace;
 use foreframe_core::error_kind::{ErrorKind, HasErrorKind as _};
 use foreframe_core::registry;
@@ -64,7 +64,7 @@ pub(super) fn run(args: &AdaptArgs) -> Result<(), CliError> {
     let start = workspace.load_weights(&args.from)?;
     let (directory, dataset) = workspace.open_dataset(&args.dataset)?;
     let settings = settings(args, &directory)?;
-    warn_of(&dataset);
+    warn_of_small_channels(&dataset);
     let cancelled = interrupt::flag()?;
     let adaptation = Adaptation::of(&base, dataset, &settings, &cancelled)
         .map_err(interrupted("stopped before the training; nothing was written"))?;

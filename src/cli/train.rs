@@ -98,7 +98,7 @@ pub(super) fn run(args: &TrainArgs) -> Result<(), CliError> {
         config.validate()?;
         training::parameter_count(config, dataset.info())?;
     }
-    warn_of(&dataset);
+    warn_of_small_channels(&dataset);
     note_camera(&dataset, &config);
     let run_dir = args
         .out
@@ -166,7 +166,7 @@ fn open_datasets(
 }
 
 /// Warns of channels that the networks see too small.
-pub(super) fn warn_of(dataset: &Dataset) {
+pub(super) fn warn_of_small_channels(dataset: &Dataset) {
     for sentence in small_channels(dataset) {
         tracing::warn!("{sentence}");
     }

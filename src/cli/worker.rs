@@ -46,8 +46,8 @@ pub(super) fn run(args: &WorkerArgs) -> Result<(), CliError> {
 /// `foreframe run-job`: the child process of a server or worker that runs one job.
 pub(super) fn run_job() -> Result<(), CliError> {
     // The settings of the server come later, with the job.
-    let format = match std::env::var("FOREFRAME_LOG_FORMAT") {
-        Ok(format) if format == "json" => LogFormat::Json,
+    let format = match std::env::var(child::LOG_FORMAT) {
+        Ok(format) if format == LogFormat::Json.name() => LogFormat::Json,
         _ => LogFormat::Text,
     };
     let _telemetry = telemetry::init(format, None)?;

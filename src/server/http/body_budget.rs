@@ -33,7 +33,7 @@ pub(in crate::server) enum BodyBudgetError {
         limit: usize,
     },
     /// One alone.
-    #[error("it is longer than {limit} bytes (setting max_total_body_bytes)")]
+    #[error("the body or message is longer than {limit} bytes (setting max_total_body_bytes)")]
     TooLong {
         /// The budget.
         limit: usize,

@@ -71,8 +71,7 @@ impl DatasetInfo {
         simulated.map(CameraConfig::model_with_height).or(self.camera)
     }
 
-    /// What the content hash leaves out of what a model is trained for: camera, channels, frame size and period, as JSON in one
-    /// line.
+    /// Camera, channels, frame size and frame period, as JSON in one line: a model depends on them, but the content hash does not.
     #[doc(hidden)]
     #[must_use]
     pub fn description(&self) -> String {

@@ -14,7 +14,7 @@ const MOST_FRAMES: f64 = 0.95;
 /// The share of the frames with the least values, and of those with the greatest, that can be outliers. Since `MOST_FRAMES` are not
 /// equal, the others have a range.
 const OUTER_FRAMES: f64 = 0.02;
-/// In a short recording, these are so many on each side, or a tenth if that is less: wrong values seldom come alone.
+/// At least so many on each side, but no more than a tenth of the frames: wrong values seldom come alone.
 const LEAST_OUTER_FRAMES: usize = 2;
 /// Warn if a value is further from those of the other frames than this many times their range.
 const FAR_RANGES: f64 = 5.0;
@@ -132,7 +132,7 @@ pub(super) fn warnings(channels: &[ChannelSummary]) -> Vec<String> {
         ));
     }
     warnings.extend(channels.iter().filter_map(ChannelSummary::warning));
-    warnings.extend(channels.iter().filter_map(ChannelSummary::smallness));
+    warnings.extend(channels.iter().filter_map(ChannelSummary::scale_warning));
     warnings
 }
 
@@ -140,7 +140,7 @@ pub(super) fn warnings(channels: &[ChannelSummary]) -> Vec<String> {
 #[doc(hidden)]
 #[must_use]
 pub fn small_channels(dataset: &Dataset) -> Vec<String> {
-    of(dataset).iter().filter_map(ChannelSummary::smallness).collect()
+    of(dataset).iter().filter_map(ChannelSummary::scale_warning).collect()
 }
 
 impl ChannelSummary {
@@ -150,15 +150,16 @@ impl ChannelSummary {
         self.min == self.max
     }
 
-    fn smallness(&self) -> Option<String> {
+    fn scale_warning(&self) -> Option<String> {
         let least = f64::from(MIN_CHANNEL_STD);
         (!self.is_constant() && self.std < least).then(|| {
             format!(
-                "The standard deviation of the {} \"{}\" is {}. The networks divide by the deviation, but at least by 0.001, so \
+                "The standard deviation of the {} \"{}\" is {}. The networks divide by the deviation, but at least by {}, so \
                  they see this channel {} times too small. Give it in a smaller unit before you import it, such as mm for m.",
                 self.role,
                 self.name,
                 number(self.std),
+                number(least),
                 number(least / self.std)
             )
         })
@@ -230,7 +231,7 @@ mod tests {
     fn a_channel_that_varies_too_little_for_the_networks_is_found() {
         let found = |size: f64| {
             let values = (0..300).map(|frame| size * (f64::from(frame) * 0.3).sin()).collect();
-            summary(ChannelRole::Action, &Channel::new("turn", ""), values).smallness()
+            summary(ChannelRole::Action, &Channel::new("turn", ""), values).scale_warning()
         };
         let warning = found(1e-4).unwrap();
         assert!(

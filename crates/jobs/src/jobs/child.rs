@@ -29,7 +29,7 @@ const POLL_EVERY: Duration = Duration::from_millis(20);
 /// A cancelled child that has not stopped after this time is killed.
 const CANCEL_GRACE: Duration = Duration::from_secs(8);
 /// The format of log lines, which a child needs before it reads its order.
-const LOG_FORMAT: &str = "FOREFRAME_LOG_FORMAT";
+pub const LOG_FORMAT: &str = "FOREFRAME_LOG_FORMAT";
 /// After how many milliseconds the allocator gives freed memory back; -1: never.
 const PURGE_DELAY: &str = "MIMALLOC_PURGE_DELAY";
 

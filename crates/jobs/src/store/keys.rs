@@ -1,55 +1,25 @@
 //! The API keys. Only the hash of each secret is stored.
 
-use std::fmt;
-use std::str::FromStr;
-
 use serde::Deserialize;
 
 use super::audit::Author;
 use super::database::{Tx, read_all, values};
 use super::{Store, StoreError};
+use foreframe_core::named_enum;
 
-/// What a key allows. Each scope includes those before it.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum KeyScope {
-    /// Predictions, sessions, streams and environments; reading the models.
-    Predict,
-    /// Also jobs and data sets.
-    Jobs,
-    /// Also activating and deleting versions, deleting data sets, and the audit trail.
-    Admin,
-}
-
-impl KeyScope {
-    /// All scopes, the smallest first.
-    pub const ALL: [Self; 3] = [Self::Predict, Self::Jobs, Self::Admin];
-
-    /// Its name.
-    #[must_use]
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Predict => "predict",
-            Self::Jobs => "jobs",
-            Self::Admin => "admin",
-        }
+named_enum! {
+    /// What a key allows. Each scope includes those before it.
+    #[derive(PartialOrd, Ord, Deserialize)]
+    #[serde(rename_all = "lowercase")]
+    pub enum KeyScope {
+        /// Predictions, sessions, streams and environments; reading the models.
+        Predict = "predict",
+        /// Also jobs and data sets.
+        Jobs = "jobs",
+        /// Also activating and deleting versions, deleting data sets, and the audit trail.
+        Admin = "admin",
     }
-}
-
-impl fmt::Display for KeyScope {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(self.name())
-    }
-}
-
-impl FromStr for KeyScope {
-    type Err = String;
-
-    /// Errors: a sentence that lists the scopes.
-    fn from_str(text: &str) -> Result<Self, String> {
-        let found = Self::ALL.into_iter().find(|scope| scope.name() == text);
-        found.ok_or_else(|| format!("there is no scope {text:?}; there are: predict, jobs, admin"))
-    }
+    else |text| -> String { format!("there is no scope {text:?}; there are: {}", Self::ALL.map(Self::name).join(", ")) }
 }
 
 /// The row of an API key.

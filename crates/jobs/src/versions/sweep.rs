@@ -11,7 +11,7 @@ use crate::store::StoreError;
 use foreframe_core::files::{open_lock, try_lock};
 use foreframe_core::types::ModelName;
 
-/// The file that who publishes locks together with others, and who cleans up alone.
+/// The lock file. Publications hold it together, the cleanup holds it alone.
 const PUBLISH_LOCK: &str = "publish.lock";
 
 impl Versions {

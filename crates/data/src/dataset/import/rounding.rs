@@ -34,8 +34,8 @@ fn note(role: &str, channel: &Channel, values: impl Iterator<Item = f32>) -> Opt
     (range > 0.0 && apart > COARSE_SHARE * range).then(|| {
         let name = &channel.name;
         format!(
-            "the {role} {name:?} is from {least} to {most}; data sets store 32 bits of a number, which are {apart} apart there, so \
-             small changes are lost: subtract an origin near to the values before the import"
+            "the {role} {name:?} is from {least} to {most}; data sets store 32-bit numbers, which are {apart} apart at this size, so \
+             smaller changes are lost; subtract an origin near the values before the import"
         )
     })
 }

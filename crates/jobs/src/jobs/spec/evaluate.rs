@@ -9,7 +9,7 @@ use super::{
 use crate::jobs::JobError;
 use crate::store::JobId;
 use foreframe_core::types::{DatasetName, ModelName};
-use foreframe_train::evaluation::EvaluateConfig;
+use foreframe_train::evaluation::{EvaluateConfig, MIN_RESAMPLES};
 
 /// An evaluation: writes a report with figures, which the job's files contain.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
@@ -75,7 +75,7 @@ impl EvaluateSpec {
         check_version("version", self.version, self.after, available.models.get(&self.model))?;
         check_parts(self.parts, self.part)?;
         check_range("windows", self.windows, 1..=MAX_WINDOWS)?;
-        check_range("resamples", self.resamples, 100..=MAX_RESAMPLES)
+        check_range("resamples", self.resamples, MIN_RESAMPLES..=MAX_RESAMPLES)
     }
 
     /// Its parts; none if it is computed as a whole. There are never more parts than batches.

@@ -13,6 +13,9 @@ use crate::dataset::import::{ImportError, ImportOptions};
 
 /// The description, which every data set of `LeRobot` has.
 pub(super) const INFO: &str = "meta/info.json";
+/// The features that become the action and the state, if no others are named.
+pub(super) const ACTION: &str = "action";
+pub(super) const STATE: &str = "observation.state";
 /// The greatest size of a vector feature.
 const MAX_COMPONENTS: usize = 10_000;
 /// Types whose values are read as numbers.
@@ -158,13 +161,7 @@ impl Description {
         }
         Ok(components)
     }
-}
 
-/// The features that become the action and the state, if no others are named.
-pub(super) const ACTION: &str = "action";
-pub(super) const STATE: &str = "observation.state";
-
-impl Description {
     /// What is said about action and state if they should have been found by name, but are no numbers.
     pub(super) fn notes(&self, options: &ImportOptions) -> Vec<String> {
         let found = [(ACTION, &options.actions), (STATE, &options.states)].into_iter();
