@@ -159,7 +159,7 @@ impl ChannelSummary {
                 self.role,
                 self.name,
                 number(self.std),
-                number(least),
+                MIN_CHANNEL_STD,
                 number(least / self.std)
             )
         })
